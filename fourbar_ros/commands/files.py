@@ -1,0 +1,60 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Output files that are either whole or not there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import tempfile
+from typing import TextIO
+
+from ..errors import FourbarError
+
+
+class OutputError(FourbarError):
+    """An output file or folder that cannot be written."""
+
+
+@contextmanager
+def write_whole(path: Path) -> Iterator[TextIO]:
+    """
+    Open a text file that appears under its name only once it is complete.
+
+    :raises OutputError: the folder is missing or not writable, or the disk is full.
+    """
+    name = ''
+    try:
+        with tempfile.NamedTemporaryFile(
+                'w', encoding='utf-8', newline='\n', dir=path.parent,
+                prefix=f'.{path.name}.', delete=False) as file:
+            name = file.name
+            yield file
+        os.chmod(name, 0o666 & ~_umask())
+        os.replace(name, path)
+    except BaseException as error:
+        if name:
+            Path(name).unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise OutputError(f'cannot write {path}: {error.strerror or error}') from None
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

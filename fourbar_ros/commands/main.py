@@ -1,0 +1,108 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+# PYTHON_ARGCOMPLETE_OK
+
+"""
+Dispatch `fourbar NAME ...`, and `ros2 run fourbar_ros NAME ...`, to the module behind the name.
+
+A command is a module with HELP, `add_arguments(parser)` and `run(args)`. A node takes ROS
+arguments instead, so its name and `--ros-args ...` go to `fourbar_ros.nodes.NAME.main`. Modules
+are imported when their name is used, so that no command waits for another one's libraries.
+"""
+
+from __future__ import annotations
+
+import argparse
+from importlib import import_module
+import logging
+import os
+import sys
+
+from .. import __version__
+from ..errors import FourbarError
+
+NODES = {
+    'plant': 'simulated air table with the linkage on it',
+    'estimator': 'Kalman filter on link angles and wheel motion',
+    'controller': 'tracking law and wheel allocation',
+}
+COMMANDS = {
+    **NODES,
+    'setpoint': 'move links to new angles',
+    'arm': 'let the wheels be driven',
+    'disarm': 'stop driving the wheels, they coast',
+    'stop': 'emergency stop, latched',
+    'reset': 'release the emergency stop',
+    'status': 'show device and controller',
+    'record': 'write topics to a rosbag2 directory',
+    'report': 'turn a bag into an HTML report and metrics',
+    'demo': 'the whole loop, from start to report',
+    'simulate': 'integrate one motion, without ROS',
+}
+
+USAGE_ERROR = 2
+INTERRUPTED = 130
+
+
+def main(argv: list[str] | None = None) -> int:
+    """
+    Run one command.
+
+    :param argv: the command's name and arguments, default those of the process.
+    :returns: exit code, 0 for success, 2 for bad input.
+    """
+    argv = sys.argv[1:] if argv is None else argv
+    logging.basicConfig(format='fourbar: %(message)s', level=logging.WARNING)
+    name = argv[0] if argv else ''
+    try:
+        if name in NODES:
+            code: int = import_module(f'fourbar_ros.nodes.{name}').main(argv[1:])
+            return code
+        args = _parser(name).parse_args(argv)
+        if not args.command:
+            _parser('').print_help()
+            return USAGE_ERROR
+        code = import_module(f'fourbar_ros.commands.{args.command}').run(args)
+        return code
+    except FourbarError as error:
+        print(f'fourbar {name}: {error}', file=sys.stderr)
+        return USAGE_ERROR
+    except KeyboardInterrupt:
+        print(f'fourbar {name}: interrupted', file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The reader of our output went away (`| head`): nothing left to say, not even at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _parser(name: str) -> argparse.ArgumentParser:
+    """Make the parser; only the named command brings its own arguments (all when completing)."""
+    parser = argparse.ArgumentParser(
+        prog='fourbar', description='A free-floating four-bar linkage: simulate, estimate, '
+        'control, drive and look at it over ROS 2 topics.')
+    parser.add_argument('--version', action='version', version=f'fourbar_ros {__version__}')
+    subparsers = parser.add_subparsers(dest='command', metavar='COMMAND', title='commands')
+    completing = '_ARGCOMPLETE' in os.environ
+    for command, text in COMMANDS.items():
+        subparser = subparsers.add_parser(
+            command, help=text, description=f'{text[0].upper()}{text[1:]}.',
+            formatter_class=argparse.RawDescriptionHelpFormatter)
+        if command not in NODES and (completing or command == name):
+            import_module(f'fourbar_ros.commands.{command}').add_arguments(subparser)
+    if completing:
+        import argcomplete
+        argcomplete.autocomplete(parser)
+    return parser

@@ -1,0 +1,157 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Loop closure: `l_b e(phi_b) + l_c e(phi_c) = l_a e(phi_a) + l_d e(phi_d)` and its two branches.
+
+For given (phi_a, phi_b) joint 3 lies on either side of the diagonal from joint 2 to joint 4. The
+assembly is *open* where joints 1 and 3 are on opposite sides of it, *crossed* where they are on
+the same side. Along a motion the side of joint 3, `sign(sin(phi_d - phi_c))`, can change only where
+c and d fold onto a line (a change point).
+"""
+
+from __future__ import annotations
+
+from math import acos, atan2, cos, hypot, pi, sin
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import FourbarError
+from .parameters import Array, LINK_NAMES, Mechanism
+
+BRANCHES = ('open', 'crossed')
+
+# Each link's sign in the closure written as a sum that vanishes.
+SIGNS = (-1.0, 1.0, 1.0, -1.0)
+
+
+class ClosureError(FourbarError):
+    """Link angles that the linkage cannot take."""
+
+
+def wrap(angle: float) -> float:
+    """Bring an angle [rad] into (-pi, pi]."""
+    wrapped = angle - 2.0 * pi * round(angle / (2.0 * pi))
+    return pi if wrapped <= -pi else wrapped
+
+
+def closure_error(mechanism: Mechanism, link_angles: ArrayLike) -> float:
+    """
+    Measure the gap at joint 3.
+
+    :param link_angles: (4,) [rad].
+    :returns: distance between the two ends that joint 3 should join [m].
+    """
+    angles = np.asarray(link_angles, dtype=float)
+    arms = np.array(SIGNS) * mechanism.link_lengths
+    return hypot(float(arms @ np.cos(angles)), float(arms @ np.sin(angles)))
+
+
+def branch_of(link_angles: ArrayLike) -> str:
+    """
+    Tell which assembly the linkage is in.
+
+    :param link_angles: (4,) [rad].
+    :returns: `open` or `crossed`; exactly on a change point, where both meet, `open`.
+    """
+    a, b, c, d = np.asarray(link_angles, dtype=float)
+    return 'crossed' if sin(b - a) * sin(d - c) < 0.0 else 'open'
+
+
+def assemble(
+    mechanism: Mechanism, phi_a: float, phi_b: float, branch: str = 'open',
+) -> Array:
+    """
+    Work out the four link angles from two and the branch.
+
+    :param phi_a: orientation of link a [rad].
+    :param phi_b: orientation of link b [rad].
+    :param branch: `open` or `crossed`.
+    :returns: (4,) link angles [rad], c and d in (-pi, pi].
+    :raises ClosureError: unknown branch, or the loop cannot close at this configuration.
+    """
+    if branch not in BRANCHES:
+        raise ClosureError(f'unknown branch {branch!r} (known are {", ".join(BRANCHES)})')
+    solutions = solve_pair(mechanism, (0, 1), (phi_a, phi_b))
+    for solution in solutions:
+        if branch_of(solution) == branch:
+            return solution
+    return solutions[0]     # on a change point the two are one
+
+
+def nearest_assembly(
+    mechanism: Mechanism, known: tuple[int, int], angles: tuple[float, float], near: ArrayLike,
+) -> Array:
+    """
+    Complete two link angles to four, on the branch nearest to given angles.
+
+    :param known: indices of the two links that are given (0 for link a).
+    :param angles: their orientations [rad].
+    :param near: (4,) link angles [rad]; of the result, the two that are worked out are continuous
+        with them (not wrapped).
+    :returns: (4,) link angles [rad].
+    :raises ClosureError: the loop cannot close, or the two links do not determine it.
+    """
+    reference = np.asarray(near, dtype=float)
+    solutions = solve_pair(mechanism, known, angles)
+    unwrapped = []
+    for solution in solutions:
+        result = reference + [wrap(float(x)) for x in solution - reference]
+        result[list(known)] = angles
+        unwrapped.append(result)
+    return min(unwrapped, key=lambda result: float(np.abs(result - reference).sum()))
+
+
+def solve_pair(
+    mechanism: Mechanism, known: tuple[int, int], angles: tuple[float, float],
+) -> list[Array]:
+    """
+    Work out the two other link angles from any two: both solutions.
+
+    :param known: indices of the two links that are given (0 for link a).
+    :param angles: their orientations [rad].
+    :returns: two arrays (4,) of link angles [rad], the worked out ones in (-pi, pi].
+    :raises ClosureError: the loop cannot close, or the two links do not determine it.
+    """
+    i, j = known
+    k, m = (index for index in range(4) if index not in known)
+    lengths = mechanism.link_lengths
+    names = f'{LINK_NAMES[i]} = {angles[0]:.4f} rad and {LINK_NAMES[j]} = {angles[1]:.4f} rad'
+    # s_k l_k e_k + s_m l_m e_m = gap: a triangle with sides l_k, l_m and the gap.
+    gap_x = -sum(SIGNS[n] * lengths[n] * cos(angle) for n, angle in zip(known, angles))
+    gap_y = -sum(SIGNS[n] * lengths[n] * sin(angle) for n, angle in zip(known, angles))
+    gap = hypot(gap_x, gap_y)
+    side_k, side_m = float(lengths[k]), float(lengths[m])
+    if gap < 1e-9 * (side_k + side_m):
+        raise ClosureError(f'{names} do not determine the configuration')
+    cosine = (gap * gap + side_k * side_k - side_m * side_m) / (2.0 * gap * side_k)
+    if abs(cosine) > 1.0 + 1e-12:
+        raise ClosureError(
+            f'the loop cannot close at {names}: {LINK_NAMES[k]} and {LINK_NAMES[m]} reach '
+            f'{abs(side_k - side_m):g} to {side_k + side_m:g} m, needed are {gap:g} m')
+    spread = acos(max(-1.0, min(1.0, cosine)))
+    solutions = []
+    for side in (1.0, -1.0):
+        direction = atan2(gap_y, gap_x) + side * spread
+        # The sign of link k in the closure turns its arm around.
+        phi_k = direction if SIGNS[k] > 0 else direction + pi
+        rest_x = (gap_x - side_k * cos(direction)) * SIGNS[m]
+        rest_y = (gap_y - side_k * sin(direction)) * SIGNS[m]
+        solution = np.empty(4)
+        solution[[i, j]] = angles
+        solution[k] = wrap(phi_k)
+        solution[m] = atan2(rest_y, rest_x)
+        solutions.append(solution)
+    return solutions

@@ -1,0 +1,90 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Install the package, for pip and for colcon alike; package.xml lists the same for rosdep."""
+
+from glob import glob
+import os
+import re
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'fourbar_ros'
+
+with open(os.path.join(PACKAGE, '__init__.py'), encoding='utf-8') as stream:
+    VERSION = re.search(r"^__version__ = '(.+)'$", stream.read(), re.MULTILINE).group(1)
+
+EXTRAS = {
+    'analysis': ['matplotlib', 'rosbags>=0.10', 'tqdm'],
+    'dev': [
+        'colcon-core>=0.15',
+        'colcon-library-path',
+        'colcon-output',
+        'colcon-package-selection',
+        'colcon-python-setup-py',
+        'colcon-recursive-crawl',
+        'colcon-ros>=0.5',
+        'colcon-test-result',
+        'hypothesis',
+        'mypy',
+        'pytest',
+        'ruff',
+        'sympy',
+        'types-PyYAML',
+    ],
+    # colcon runs the tests with pytest only where this extra names it.
+    'test': ['pytest'],
+}
+EXTRAS['all'] = sorted({requirement for extra in EXTRAS.values() for requirement in extra})
+
+
+def files(folder):
+    """Return what to install into the share folder from one folder: its files, if any."""
+    return f'share/{PACKAGE}/{folder}', sorted(filter(os.path.isfile, glob(f'{folder}/*')))
+
+
+setup(
+    name=PACKAGE,
+    version=VERSION,
+    description='Simulate, estimate, control and drive a free-floating four-bar linkage '
+                'with flywheels',
+    url='https://fourbar-ros.example.org',
+    maintainer='The fourbar_ros authors',
+    maintainer_email='maintainers@fourbar-ros.example.org',
+    license='Apache-2.0',
+    python_requires='>=3.10',
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    zip_safe=False,
+    install_requires=[
+        'PyYAML',
+        'argcomplete',
+        'filterpy>=2',
+        'numba>=0.59',
+        'numpy>=1.26',
+        'ros-jazzy-common-interfaces',
+        'ros-jazzy-rclpy>=7.1.4',
+        'ros-jazzy-rmw-fastrtps-cpp',
+        'scipy>=1.11',
+    ],
+    extras_require=EXTRAS,
+    entry_points={'console_scripts': [f'fourbar = {PACKAGE}.commands.main:main']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        files('config'),
+        files('launch'),
+        # Where `ros2 run` looks. Each is a link to the one stub _run, named for what it runs.
+        (f'lib/{PACKAGE}', sorted(glob('scripts/[!_]*'))),
+    ],
+)
