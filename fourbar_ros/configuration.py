@@ -25,8 +25,9 @@ from pathlib import Path
 import re
 from typing import Any
 
-from fourbar_ros.errors import FourbarError
 import yaml
+
+from .errors import FourbarError
 
 PACKAGE = 'fourbar_ros'
 _SUFFIXES = ('.yaml', '.yml')
@@ -152,5 +153,5 @@ class _Loader(yaml.SafeLoader):
 # files of ROS take them for numbers.
 _Loader.add_implicit_resolver(
     'tag:yaml.org,2002:float',
-    re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+'),
+    re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$'),
     list('-+.0123456789'))

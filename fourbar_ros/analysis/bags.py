@@ -110,6 +110,8 @@ class Recording:
     :param started_ns: recorder time of the first message, since 1970.
     :param duration_s: recorder time from the first message to the last.
     :param message_count: of all topics and types.
+    :param topics: type by absolute name.
+    :param counts: number of messages by absolute name.
     """
 
     path: Path
@@ -118,6 +120,7 @@ class Recording:
     duration_s: float
     message_count: int
     topics: Mapping[str, str]
+    counts: Mapping[str, int]
     _messages: Mapping[str, list[tuple[int, Any]]]
 
     @cached_property
@@ -233,6 +236,9 @@ def _read(path: Path, namespace: str | None, progress: Any) -> Recording:
         chosen = [connection for connection in reader.connections
                   if connection.msgtype in (JOINT_STATE, DIAGNOSTIC_STATUS)]
         messages = {topic: [] for topic in topics}
+        counts = dict.fromkeys(topics, 0)
+        for connection in reader.connections:
+            counts[connection.topic] += connection.msgcount
         expected = sum(connection.msgcount for connection in chosen)
         stream: Iterable[Any] = reader.messages(chosen) if chosen else ()
         for connection, received_ns, data in progress(stream, expected) if progress else stream:
@@ -244,7 +250,7 @@ def _read(path: Path, namespace: str | None, progress: Any) -> Recording:
         empty = reader.message_count == 0
         return Recording(
             path, namespace, 0 if empty else reader.start_time, reader.duration * 1e-9,
-            reader.message_count, topics, messages)
+            reader.message_count, topics, counts, messages)
 
 
 def _joint_series(topic: str, messages: list[tuple[int, Any]]) -> JointSeries:

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import FourbarError
+from .angles import wrap
 from .parameters import Array, LINK_NAMES, Mechanism
 
 BRANCHES = ('open', 'crossed')
@@ -39,12 +40,6 @@ SIGNS = (-1.0, 1.0, 1.0, -1.0)
 
 class ClosureError(FourbarError):
     """Link angles that the linkage cannot take."""
-
-
-def wrap(angle: float) -> float:
-    """Bring an angle [rad] into (-pi, pi]."""
-    wrapped = angle - 2.0 * pi * round(angle / (2.0 * pi))
-    return pi if wrapped <= -pi else wrapped
 
 
 def closure_error(mechanism: Mechanism, link_angles: ArrayLike) -> float:

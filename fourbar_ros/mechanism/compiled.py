@@ -58,10 +58,10 @@ def kernel(**options: Any) -> Callable[[_Function], _Function]: ...
 
 def kernel(function: _Function | None = None, /, **options: Any) -> Any:
     """
-    Compile a function with numba in nopython mode; use as `@kernel` or `@kernel(parallel=True)`.
+    Compile a function with numba in nopython mode, and keep the code.
 
-    Division by zero gives inf or nan as in numpy, floating point is not reordered, and the code
-    is cached. Options are those of `numba.njit`.
+    Use it bare or with options of `numba.njit`: `@kernel`, `@kernel(parallel=True)`. Division by
+    zero gives inf or nan as in numpy, and floating point is not reordered.
     """
     if function is None:
         return functools.partial(kernel, **options)

@@ -115,6 +115,12 @@ class Mechanism:
             np.array(self.link_lengths), cosine, sine, np.array(self.flywheel_inertias),
             float(masses.sum()))
 
+    @cached_property
+    def constants_with_locked_wheels(self) -> Constants:
+        """Work out the constants of a linkage whose wheels turn with their links."""
+        free = self.constants
+        return free._replace(cosine=free.cosine + np.diag(self.flywheel_inertias))
+
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], origin: str) -> Mechanism:
         """

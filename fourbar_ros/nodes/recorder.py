@@ -33,10 +33,9 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
-from rosbags.interfaces import (
-    Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime)
+import rosbags.interfaces as bag
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
-from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys import get_typestore, Stores, TypesysError
 from tqdm import tqdm
 
 INTERNAL_TOPICS = ('/rosout', '/parameter_events')
@@ -64,7 +63,7 @@ class Recorder(Node):
         self._publishers = {}
         self._skipped = set()
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time may be paused
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time can stand still
         self.create_timer(GRAPH_POLL_S, self._follow_graph, clock=steady)
 
     def _follow_graph(self):
@@ -79,9 +78,8 @@ class Recorder(Node):
             self._publishers[topic] = publishers
 
     def _is_wanted(self, topic):
-        if self.wanted:
-            return topic in self.wanted
-        return topic not in self.excluded and not topic_or_service_is_hidden(topic)
+        unwanted = topic in self.excluded or topic_or_service_is_hidden(topic)
+        return topic in self.wanted if self.wanted else not unwanted
 
     def _offered(self, topic):
         return [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
@@ -94,7 +92,7 @@ class Recorder(Node):
             connection = self.writer.add_connection(
                 topic, type_name, typestore=self._typestore,
                 offered_qos_profiles=[offered_qos(qos) for qos in offered])
-        except Exception as error:  # a broken message package can raise anything
+        except (ImportError, AttributeError, TypesysError) as error:
             self._skipped.add(topic)
             tqdm.write(f'not recording {topic}: type {type_name} is unknown here ({error})')
             return
@@ -133,11 +131,12 @@ def matching_qos(offered):
 def offered_qos(qos):
     """Convert a QoSProfile of rclpy to what rosbags writes."""
     deadline, lifespan, lease = (
-        QosTime(*divmod(duration.nanoseconds, 10**9))
+        bag.QosTime(*divmod(duration.nanoseconds, 10**9))
         for duration in (qos.deadline, qos.lifespan, qos.liveliness_lease_duration))
-    return Qos(QosHistory(int(qos.history)), qos.depth, QosReliability(int(qos.reliability)),
-               QosDurability(int(qos.durability)), deadline, lifespan,
-               QosLiveliness(int(qos.liveliness)), lease, qos.avoid_ros_namespace_conventions)
+    return bag.Qos(
+        bag.QosHistory(int(qos.history)), qos.depth, bag.QosReliability(int(qos.reliability)),
+        bag.QosDurability(int(qos.durability)), deadline, lifespan,
+        bag.QosLiveliness(int(qos.liveliness)), lease, qos.avoid_ros_namespace_conventions)
 
 
 def record(directory, topics=(), *, exclude_internal=False, ros_args=(), live=False):
@@ -149,15 +148,14 @@ def record(directory, topics=(), *, exclude_internal=False, ros_args=(), live=Fa
     :param ros_args: what follows ``--ros-args`` on the command line.
     :param live: show a running count.
     :returns: number of messages by topic.
-    :raises RecorderError: it cannot start, or writing failed on the way.
+    :raises RecorderError: it cannot start, or cannot write.
     """
     stopped = []
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stopped.append(True))
-    arguments = ['--ros-args', *ros_args]
     try:
         writer = Writer(directory, version=9, storage_plugin=StoragePlugin.MCAP)
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=['--ros-args', *ros_args], signal_handler_options=SignalHandlerOptions.NO)
         node = Recorder(writer, topics, exclude_internal)
         with writer, tqdm(unit=' messages', disable=not live, leave=False) as progress:
             tqdm.write(f'recording to {directory}')

@@ -1,0 +1,37 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How the four wheels share what two axes need."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..mechanism.parameters import Array
+
+
+def minimum_norm(wheel_map: Array, flywheel_inertias: Array, demand: Array) -> Array:
+    """
+    Find the torques with the smallest norm of wheel accelerations (paper eq. 8, corrected).
+
+    With `I_f = -G diag(If)` of eq. 6, `s = I_f^T (I_f I_f^T)^-1 (A du + b)` and `tau = If s`.
+
+    :param wheel_map: G (2, 4).
+    :param flywheel_inertias: If (4,) [kg m^2].
+    :param demand: A du + b (2,) [N m].
+    :returns: (4,) torques on the wheels [N m].
+    """
+    weighted = wheel_map * flywheel_inertias ** 2
+    torques: Array = -weighted.T @ np.linalg.solve(weighted @ wheel_map.T, demand)
+    return torques

@@ -1,0 +1,72 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Reference motion: the paper's soft step as a quintic with given ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..mechanism.parameters import Array
+
+
+@dataclass(frozen=True, eq=False)
+class SoftStep:
+    """
+    A move between two states that starts and ends with continuous rate and acceleration.
+
+    From rest it is the paper's soft step, `10 s^3 - 15 s^4 + 6 s^5`. Started in motion it takes
+    over rate and acceleration without a jump. Axes are (phi_a, phi_b).
+
+    :param start: (3, 2) angle, rate and acceleration at time 0 [rad, rad/s, rad/s^2].
+    :param goal: (2,) angles at the end, at rest [rad].
+    :param duration: [s].
+    """
+
+    start: Array
+    goal: Array
+    duration: float
+
+    def at(self, time: float) -> Array:
+        """
+        Evaluate angle, rate and acceleration: (3, 2).
+
+        :param time: since the start; before 0 the start, after the duration the goal at rest [s].
+        """
+        if time >= self.duration:
+            return np.array([self.goal, np.zeros(2), np.zeros(2)])
+        s = max(time, 0.0) / self.duration
+        powers = np.array([
+            [1.0, s, s ** 2, s ** 3, s ** 4, s ** 5],
+            [0.0, 1.0, 2.0 * s, 3.0 * s ** 2, 4.0 * s ** 3, 5.0 * s ** 4],
+            [0.0, 0.0, 2.0, 6.0 * s, 12.0 * s ** 2, 20.0 * s ** 3],
+        ])
+        scaling = np.array([1.0, 1.0 / self.duration, 1.0 / self.duration ** 2])
+        values: Array = scaling[:, None] * (powers @ self._coefficients())
+        return values
+
+    def _coefficients(self) -> Array:
+        """Return the polynomial's coefficients in time / duration: (6, 2)."""
+        angle = self.start[0]
+        rate = self.start[1] * self.duration
+        bend = self.start[2] * self.duration ** 2
+        rise = self.goal - angle
+        return np.array([
+            angle, rate, bend / 2.0,
+            10.0 * rise - 6.0 * rate - 1.5 * bend,
+            -15.0 * rise + 8.0 * rate + 1.5 * bend,
+            6.0 * rise - 3.0 * rate - 0.5 * bend,
+        ])

@@ -1,0 +1,28 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a testbed is, simulated or real: samples in, torques out, and when it may be driven."""
+
+from .command import CommandError, torques_by_name
+from .gate import ArmingGate, DeviceState
+from .pacing import RealtimePace
+from .protocol import Device, LinkSample, Samples, WheelSample
+from .simulated import SimulatedTable
+from .testbed import Testbed, TestbedSettings, Timing
+
+__all__ = [
+    'ArmingGate', 'CommandError', 'Device', 'DeviceState', 'LinkSample', 'RealtimePace',
+    'Samples', 'SimulatedTable', 'Testbed', 'TestbedSettings', 'Timing', 'torques_by_name',
+    'WheelSample',
+]

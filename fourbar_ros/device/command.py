@@ -1,0 +1,66 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Wheel commands as they come in: taken whole or rejected whole."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..errors import FourbarError
+from ..mechanism import FLYWHEEL_NAMES
+from ..mechanism.parameters import Array
+
+
+class CommandError(FourbarError):
+    """
+    A wheel command that is rejected.
+
+    :ivar kind: one word for counting.
+    """
+
+    def __init__(self, kind: str, message: str) -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+def torques_by_name(names: Sequence[str], positions: Sequence[float],
+                    velocities: Sequence[float], efforts: Sequence[float]) -> Array:
+    """
+    Turn a command by wheel names into torques.
+
+    :param names: wheels in any order; one that is not named gets no torque.
+    :param positions, velocities: must be empty, wheels are commanded by effort.
+    :param efforts: torque for each name [N m].
+    :returns: (4,) torques in the order a, b, c, d [N m].
+    :raises CommandError: anything else; kinds `fields`, `names`, `length`, `finite`.
+    """
+    if len(positions) or len(velocities):
+        raise CommandError('fields', 'position and velocity must be empty, only effort is taken')
+    for index, name in enumerate(names):
+        if name not in FLYWHEEL_NAMES:
+            raise CommandError('names', f'unknown wheel {name!r} (known are '
+                                        f'{", ".join(FLYWHEEL_NAMES)})')
+        if name in names[:index]:
+            raise CommandError('names', f'{name} is named twice')
+    if not len(names) or len(efforts) != len(names):
+        raise CommandError('length', f'{len(names)} names but {len(efforts)} efforts')
+    torques = np.zeros(4)
+    for name, effort in zip(names, efforts):
+        if not np.isfinite(effort):
+            raise CommandError('finite', f'effort of {name} is {effort}')
+        torques[FLYWHEEL_NAMES.index(name)] = effort
+    return torques

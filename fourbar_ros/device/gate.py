@@ -1,0 +1,94 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The arming gate: whether the wheels may be driven, and why not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Enum
+
+
+class DeviceState(Enum):
+    """Whether the wheels may be driven; only `armed` lets torque through."""
+
+    DISARMED = 'disarmed'
+    ARMED = 'armed'
+    EMERGENCY_STOP = 'emergency_stop'
+    FAULT = 'fault'
+
+
+class ArmingGate:
+    """
+    A small state machine with one way to drive wheels and many ways to stop.
+
+    Emergency stop and fault are latched: only a reset leads out of them, and only to disarmed.
+
+    :ivar state: present state.
+    :ivar reason: why it is in this state.
+    :ivar since_ns: stamp of the change [ns].
+    """
+
+    def __init__(self) -> None:
+        self.state = DeviceState.DISARMED
+        self.reason = 'not armed since start'
+        self.since_ns = 0
+
+    @property
+    def armed(self) -> bool:
+        """Tell whether torque may pass."""
+        return self.state is DeviceState.ARMED
+
+    def arm(self, stamp_ns: int, obstacles: Sequence[str]) -> tuple[bool, str]:
+        """
+        Ask to let torque through.
+
+        :param obstacles: what else speaks against it.
+        :returns: whether the gate is armed now, and why (not).
+        """
+        if self.armed:
+            return True, 'already armed'
+        if self.state is not DeviceState.DISARMED:
+            return False, (f'refused: {self.state.value} ({self.reason}), '
+                           'call reset_emergency_stop first')
+        if obstacles:
+            return False, f'refused: {"; ".join(obstacles)}'
+        self._enter(DeviceState.ARMED, 'armed on request', stamp_ns)
+        return True, 'armed'
+
+    def disarm(self, stamp_ns: int, reason: str) -> None:
+        """Stop driving; a latched state stays."""
+        if self.armed:
+            self._enter(DeviceState.DISARMED, reason, stamp_ns)
+
+    def emergency_stop(self, stamp_ns: int, reason: str) -> None:
+        """Stop driving until reset; the first reason is kept."""
+        if self.state is not DeviceState.EMERGENCY_STOP:
+            self._enter(DeviceState.EMERGENCY_STOP, reason, stamp_ns)
+
+    def fail(self, stamp_ns: int, reason: str) -> None:
+        """Stop driving because the device failed; an emergency stop stays what it is."""
+        if self.state not in (DeviceState.EMERGENCY_STOP, DeviceState.FAULT):
+            self._enter(DeviceState.FAULT, reason, stamp_ns)
+
+    def reset(self, stamp_ns: int) -> tuple[bool, str]:
+        """Release emergency stop or fault; the wheels stay disarmed."""
+        if self.state not in (DeviceState.EMERGENCY_STOP, DeviceState.FAULT):
+            return True, f'nothing to reset: {self.state.value}'
+        before = self.state.value
+        self._enter(DeviceState.DISARMED, f'{before} was reset', stamp_ns)
+        return True, f'{before} is reset, disarmed'
+
+    def _enter(self, state: DeviceState, reason: str, stamp_ns: int) -> None:
+        self.state, self.reason, self.since_ns = state, reason, stamp_ns

@@ -1,0 +1,242 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A device behind its arming gate: commands are checked, watched, limited, and stopped.
+
+All times come in as arguments: `stamp_ns` is the time that messages carry, `steady_ns` a clock
+that nobody can set or freeze.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import FourbarError
+from ..mechanism import LINK_NAMES
+from ..mechanism.parameters import Array
+from .command import CommandError, torques_by_name
+from .gate import ArmingGate
+from .protocol import Device, Samples
+
+TIMEOUT_ACTIONS = ('coast', 'hold_speed', 'brake')
+
+# Bandwidth of the wheel-speed loop behind `hold_speed` and `brake` [rad/s].
+PARKING_BANDWIDTH = 30.0
+
+
+@dataclass(frozen=True)
+class TestbedSettings:
+    """
+    When to stop by itself, and how.
+
+    :param command_timeout_s: longest time without a command while armed [s].
+    :param sensor_timeout_s: a link sensor without a sample for so long is silent [s].
+    :param timeout_action: what the wheels do when commands stay away: `coast` (no torque),
+        `hold_speed` or `brake` (to rest relative to the link, which turns the links).
+    """
+
+    __test__ = False    # not a test class, whatever its name
+
+    command_timeout_s: float = 0.1
+    sensor_timeout_s: float = 0.2
+    timeout_action: str = 'coast'
+
+
+@dataclass(frozen=True)
+class Timing:
+    """
+    How the loop around the device keeps time.
+
+    :param round_trip_s: from a tick to the command that answers it, None if none did [s].
+    :param command_age_s: how long ago the command now in force came, None if none is [s].
+    :param lost: ticks that were not answered within one period, since the first answer.
+    :param step_s: time that the device needed for the last step [s].
+    """
+
+    round_trip_s: float | None
+    command_age_s: float | None
+    lost: int
+    step_s: float
+
+
+class Testbed:
+    """
+    One device, its gate, its watchdogs.
+
+    :ivar gate: whether the wheels may be driven.
+    :ivar rejected: number of rejected commands by kind.
+    :ivar clipped: number of commands that asked more torque than a motor has.
+    :ivar last_rejection: what was wrong with the last rejected command, or ''.
+    """
+
+    __test__ = False
+
+    def __init__(self, device: Device, settings: TestbedSettings) -> None:
+        self.device = device
+        self.gate = ArmingGate()
+        self.rejected: Counter[str] = Counter()
+        self.clipped = 0
+        self.last_rejection = ''
+        self._settings = settings
+        self._torques = np.zeros(4)
+        self._parked_speeds: Array | None = None
+        self._wheel_speeds = np.zeros(4)
+        self._link_seen_ns: list[int | None] = [None] * 4
+        self._tick_ns: int | None = None
+        self._published_steady_ns = 0
+        self._step_ns = 0
+        self._command_stamp_ns: int | None = None
+        self._command_steady_ns: int | None = None
+        self._armed_steady_ns = 0
+        self._round_trip_ns: int | None = None
+        self._lost = 0
+
+    def tick(self, stamp_ns: int, steady_ns: int) -> tuple[Samples, Timing]:
+        """
+        Drive the device up to a tick and sample it.
+
+        :raises FourbarError: the device failed; the gate is in `fault`, and stays there.
+        """
+        timing = self._close_period(steady_ns)
+        self._watch_commands(stamp_ns, steady_ns)
+        try:
+            samples = self.device.step(stamp_ns, self._driving_torques())
+        except FourbarError as error:
+            self._torques[:] = 0.0
+            self.gate.fail(stamp_ns, str(error))
+            raise
+        self._tick_ns = stamp_ns
+        self._wheel_speeds = samples.wheels.speeds
+        for sample in samples.links:
+            for link in sample.links:
+                self._link_seen_ns[link] = sample.stamp_ns
+        return samples, timing
+
+    def published(self, steady_ns: int, step_ns: int) -> None:
+        """
+        Note when the samples of the last tick went out.
+
+        :param step_ns: time that the device needed for it [ns].
+        """
+        self._published_steady_ns = steady_ns
+        self._step_ns = step_ns
+
+    def command(self, stamp_ns: int, names: Sequence[str], positions: Sequence[float],
+                velocities: Sequence[float], efforts: Sequence[float], steady_ns: int) -> None:
+        """
+        Take a wheel command, to act from the last tick on.
+
+        :param stamp_ns: the tick that it answers [ns].
+        :raises CommandError: it is rejected whole; also counted.
+        """
+        try:
+            self._check_stamp(stamp_ns)
+            torques = torques_by_name(names, positions, velocities, efforts)
+        except CommandError as error:
+            self.rejected[error.kind] += 1
+            self.last_rejection = str(error)
+            raise
+        limits = self.device.mechanism.motor_torque_limits
+        limited = np.clip(torques, -limits, limits)
+        self.clipped += bool((limited != torques).any())
+        self._command_stamp_ns = stamp_ns
+        self._command_steady_ns = steady_ns
+        if self._round_trip_ns is None and stamp_ns == self._tick_ns:
+            self._round_trip_ns = steady_ns - self._published_steady_ns
+        self._torques[:] = limited
+
+    def arm(self, stamp_ns: int, steady_ns: int, obstacles: Sequence[str]) -> tuple[bool, str]:
+        """
+        Ask to drive the wheels.
+
+        :param obstacles: what speaks against it beyond what is known here.
+        :returns: whether it is armed now, and why (not).
+        """
+        silent = [name for name, seen_ns in zip(LINK_NAMES, self._link_seen_ns)
+                  if seen_ns is None
+                  or stamp_ns - seen_ns > self._settings.sensor_timeout_s * 1e9]
+        if silent:
+            obstacles = [*obstacles, f'no sample from {", ".join(silent)} for '
+                                     f'{self._settings.sensor_timeout_s:g} s']
+        was_armed = self.gate.armed
+        armed, message = self.gate.arm(stamp_ns, obstacles)
+        if armed and not was_armed:
+            self._armed_steady_ns = steady_ns
+            self._parked_speeds = None
+            self._torques[:] = 0.0
+        return armed, message
+
+    def disarm(self, stamp_ns: int, reason: str) -> None:
+        """Stop driving: the wheels coast."""
+        self._parked_speeds = None
+        self.gate.disarm(stamp_ns, reason)
+
+    def emergency_stop(self, stamp_ns: int, reason: str) -> None:
+        """Stop driving until reset: the wheels coast."""
+        self._parked_speeds = None
+        self.gate.emergency_stop(stamp_ns, reason)
+
+    def _check_stamp(self, stamp_ns: int) -> None:
+        if self._tick_ns is None:
+            raise CommandError('stale', 'no tick to answer yet')
+        age_s = (self._tick_ns - stamp_ns) * 1e-9
+        if age_s > self._settings.command_timeout_s:
+            raise CommandError('stale', f'stamp is {age_s:g} s older than the last tick, limit '
+                                        f'{self._settings.command_timeout_s:g} s')
+        if age_s < 0.0:
+            raise CommandError('stale', f'stamp is {-age_s:g} s ahead of the last tick')
+        if self._command_stamp_ns is not None and stamp_ns < self._command_stamp_ns:
+            raise CommandError('stale', 'stamp is older than that of the last command')
+
+    def _close_period(self, steady_ns: int) -> Timing:
+        """Judge how the last tick was answered."""
+        answered = self._round_trip_ns is not None
+        if not answered and self._command_stamp_ns is not None:
+            self._lost += 1
+        timing = Timing(
+            self._round_trip_ns * 1e-9 if self._round_trip_ns is not None else None,
+            (steady_ns - self._command_steady_ns) * 1e-9
+            if self._command_steady_ns is not None else None,
+            self._lost, self._step_ns * 1e-9)
+        self._round_trip_ns = None
+        return timing
+
+    def _watch_commands(self, stamp_ns: int, steady_ns: int) -> None:
+        if not self.gate.armed:
+            return
+        last_ns = max(self._armed_steady_ns, self._command_steady_ns or 0)
+        if steady_ns - last_ns > self._settings.command_timeout_s * 1e9:
+            self.gate.disarm(
+                stamp_ns, f'no flywheel_command for {self._settings.command_timeout_s:g} s')
+            if self._settings.timeout_action == 'hold_speed':
+                self._parked_speeds = self._wheel_speeds.copy()
+            elif self._settings.timeout_action == 'brake':
+                self._parked_speeds = np.zeros(4)
+
+    def _driving_torques(self) -> Array:
+        if self.gate.armed:
+            return self._torques
+        if self._parked_speeds is None:
+            return np.zeros(4)
+        mechanism = self.device.mechanism
+        gain = PARKING_BANDWIDTH * mechanism.flywheel_inertias
+        limits = mechanism.motor_torque_limits
+        torques: Array = np.clip(
+            gain * (self._parked_speeds - self._wheel_speeds), -limits, limits)
+        return torques

@@ -1,0 +1,233 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Extended Kalman filter of the linkage, x = (phi_a, phi_b, omega_a, omega_b).
+
+Process model: the linkage's own dynamics, driven by what the wheels were measured to do. With
+the motor torque `tau = If (alpha + dOmega/dt)` eliminated, the links move as if each carried its
+wheel locked to it, under the forces `-If dOmega/dt` (docs/estimation.md).
+
+Phi_c and phi_d follow by closure, continuously, on the branch that the filter was started on.
+Gamma, which links them to the state, does not exist at a change point; close to one the last
+good Gamma is kept, which is exact for a parallelogram.
+"""
+
+from __future__ import annotations
+
+from filterpy.kalman import ExtendedKalmanFilter
+import numpy as np
+
+from ..mechanism import Mechanism
+from ..mechanism.angles import wrap_angles
+from ..mechanism.compiled import kernel
+from ..mechanism.dynamics import (
+    dependent_rates, mass_matrix, NEAR_ALIGNMENT, project_onto_closure,
+)
+from ..mechanism.motion import advance_state, LINK_ANGLES, LINK_RATES, STATE_SIZE
+from ..mechanism.parameters import Array, Constants
+
+# Half width of the central differences for the transition matrix [rad], [rad/s].
+DIFFERENCE = 1e-6
+
+
+class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
+    """
+    The filter proper: predict with wheel motion, correct with link angles.
+
+    :ivar angles: (4,) link angles that belong to x, continuous [rad].
+    :ivar gamma: (2, 2) in use, `(omega_c, omega_d) = gamma (omega_a, omega_b)`.
+    :param mechanism: the linkage.
+    :param angles: (4,) initial link angles on the closure [rad].
+    :param angle_variance: of phi_a and phi_b at the start [rad^2].
+    :param rate_variance: of the rates, assumed zero, at the start [rad^2/s^2].
+    :param disturbance: density of the random torque on each link [N m/sqrt(Hz)].
+    """
+
+    def __init__(self, mechanism: Mechanism, angles: Array, angle_variance: float,
+                 rate_variance: float, disturbance: float) -> None:
+        super().__init__(dim_x=4, dim_z=4)
+        self._constants = mechanism.constants_with_locked_wheels
+        self._disturbance = disturbance
+        self._scratch = np.empty((6, STATE_SIZE))
+        self._state = np.zeros(STATE_SIZE)
+        self.angles = np.array(angles)
+        self.gamma = np.eye(2)
+        self._refresh_gamma()
+        self.x = np.array([angles[0], angles[1], 0.0, 0.0])
+        self.P = np.diag([angle_variance, angle_variance, rate_variance, rate_variance])
+
+    @property
+    def rates(self) -> Array:
+        """Return the rates of all four links (4,) [rad/s]."""
+        return np.concatenate([self.x[2:], self.gamma @ self.x[2:]])
+
+    def sigmas(self) -> tuple[Array, Array]:
+        """Return one standard deviation of the four angles [rad] and rates [rad/s]: two (4,)."""
+        to_links = np.vstack([np.eye(2), self.gamma])
+        return tuple(  # type: ignore[return-value]
+            np.sqrt(np.einsum('ij,jk,ik->i', to_links, block, to_links))
+            for block in (self.P[:2, :2], self.P[2:, 2:]))
+
+    def move(self, duration: float, wheel_torques: Array) -> None:
+        """
+        Predict over a time in which the wheels were accelerated evenly.
+
+        :param duration: [s].
+        :param wheel_torques: (4,) If dOmega/dt, the wheels' measured relative motion [N m].
+        """
+        self.F, self.Q = np.empty((4, 4)), np.empty((4, 4))
+        linearise(self.angles, self.x[2:], self.gamma, wheel_torques, duration, self._disturbance,
+                  self._constants, self._scratch, self._state, self.F, self.Q)
+        move_links(self.angles, self.x[2:], self.gamma, wheel_torques, duration,
+                   self._constants, self._scratch, self._state)
+        self.predict()
+
+    def predict_x(self, u: object = 0) -> None:
+        """Take over the state that :meth:`move` integrated (called by filterpy)."""
+        self.angles = self._state[LINK_ANGLES].copy()
+        self._refresh_gamma()
+        rates = self._state[LINK_RATES]
+        self.x = np.array([self.angles[0], self.angles[1], rates[0], rates[1]])
+
+    def correct(self, links: tuple[int, ...], measured: Array, variance: float) -> tuple[
+            Array, float]:
+        """
+        Update with measured link angles.
+
+        :param links: indices of the links that were measured (0 for link a).
+        :param measured: (n,) their angles, any turn [rad].
+        :param variance: of each [rad^2].
+        :returns: the wrapped innovations (n,) [rad] and their normalised square (NIS).
+        """
+        rows = list(links)
+        jacobian = np.zeros((len(rows), 4))
+        jacobian[:, :2] = np.vstack([np.eye(2), self.gamma])[rows]
+        before = self.x[:2].copy()
+        self.update(
+            measured, lambda x: jacobian, lambda x: self.angles[rows],
+            R=variance * np.eye(len(rows)), residual=lambda z, h: wrap_angles(z - h))
+        change = self.x[:2] - before
+        self._state[LINK_ANGLES] = self.angles + np.concatenate([change, self.gamma @ change])
+        self._state[LINK_RATES] = self.rates
+        project_onto_closure(
+            self._state[LINK_ANGLES], self._state[LINK_RATES], self._constants)
+        self.predict_x()
+        return self.y, float(self.y @ self.SI @ self.y)
+
+    def _refresh_gamma(self) -> None:
+        if abs(np.sin(self.angles[3] - self.angles[2])) > NEAR_ALIGNMENT:
+            self.gamma = np.array(
+                dependent_rates(*self.angles, self._constants.lengths)).reshape(2, 2)
+
+
+@kernel
+def move_links(angles: Array, rates: Array, gamma: Array, wheel_torques: Array, duration: float,
+               constants: Constants, scratch: Array, state: Array) -> None:
+    """
+    Integrate the links, wheels locked, under minus the torques that moved the wheels.
+
+    :param angles: (4,) [rad].
+    :param rates: (2,) of links a and b [rad/s].
+    :param state: (16,) receives angles and rates of the links.
+    """
+    state[:] = 0.0
+    state[0:4] = angles
+    state[4:6] = rates
+    state[6] = gamma[0, 0] * rates[0] + gamma[0, 1] * rates[1]
+    state[7] = gamma[1, 0] * rates[0] + gamma[1, 1] * rates[1]
+    advance_state(state, wheel_torques, wheel_torques, wheel_torques, duration, constants, scratch)
+
+
+@kernel
+def linearise(
+    angles: Array, rates: Array, gamma: Array, wheel_torques: Array, duration: float,
+    disturbance: float, constants: Constants, scratch: Array, state: Array, transition: Array,
+    noise: Array,
+) -> None:
+    """
+    Evaluate transition matrix and process noise of :func:`move_links`.
+
+    :param transition: (4, 4) receives d x(end) / d x(start).
+    :param noise: (4, 4) receives the covariance that random link torques of density
+        `disturbance` [N m/sqrt(Hz)] leave after `duration`.
+    """
+    trial_angles, trial_rates = np.empty(4), np.empty(2)
+    for column in range(4):
+        for sign in (1.0, -1.0):
+            trial_angles[:] = angles
+            trial_rates[:] = rates
+            if column < 2:
+                trial_angles[column] += sign * DIFFERENCE
+                trial_angles[2] += sign * DIFFERENCE * gamma[0, column]
+                trial_angles[3] += sign * DIFFERENCE * gamma[1, column]
+            else:
+                trial_rates[column - 2] += sign * DIFFERENCE
+            move_links(trial_angles, trial_rates, gamma, wheel_torques, duration, constants,
+                       scratch, state)
+            for row in range(4):
+                # Angles a, b are state[0:2], rates a, b are state[4:6].
+                end = state[row] if row < 2 else state[row + 2]
+                if sign > 0.0:
+                    transition[row, column] = end
+                else:
+                    transition[row, column] -= end
+                    transition[row, column] /= 2.0 * DIFFERENCE
+    _process_noise(angles, gamma, duration, disturbance, constants, noise)
+
+
+@kernel
+def _process_noise(angles: Array, gamma: Array, duration: float,
+                   disturbance: float, constants: Constants, noise: Array) -> None:
+    a00, a01, a11 = _reduced_mass(angles, gamma, constants)
+    # Covariance density of G tau for independent link torques, then of the accelerations.
+    density = disturbance * disturbance
+    f00 = density * (1.0 + gamma[0, 0] ** 2 + gamma[1, 0] ** 2)
+    f01 = density * (gamma[0, 0] * gamma[0, 1] + gamma[1, 0] * gamma[1, 1])
+    f11 = density * (1.0 + gamma[0, 1] ** 2 + gamma[1, 1] ** 2)
+    scale = 1.0 / (a00 * a11 - a01 * a01)
+    i00, i01, i11 = a11 * scale, -a01 * scale, a00 * scale
+    l00, l01 = i00 * f00 + i01 * f01, i00 * f01 + i01 * f11
+    l10, l11 = i01 * f00 + i11 * f01, i01 * f01 + i11 * f11
+    q00 = l00 * i00 + l01 * i01
+    q01 = l00 * i01 + l01 * i11
+    q11 = l10 * i01 + l11 * i11
+    for row in range(4):
+        for column in range(4):
+            axis_row, axis_column = row % 2, column % 2
+            value = q01 if axis_row != axis_column else (q11 if axis_row else q00)
+            order = (row < 2) + (column < 2)
+            if order == 2:
+                value *= duration ** 3 / 3.0
+            elif order == 1:
+                value *= duration ** 2 / 2.0
+            else:
+                value *= duration
+            noise[row, column] = value
+
+
+@kernel
+def _reduced_mass(angles: Array, gamma: Array, constants: Constants
+                  ) -> tuple[float, float, float]:
+    """Evaluate A = W^T M W with the given Gamma."""
+    matrix = mass_matrix(angles, constants)
+    a = np.zeros((2, 2))
+    for i in range(2):
+        for j in range(2):
+            a[i, j] = matrix[i, j]
+            for k in range(2):
+                a[i, j] += (matrix[i, 2 + k] * gamma[k, j] + matrix[j, 2 + k] * gamma[k, i])
+                for m in range(2):
+                    a[i, j] += gamma[k, i] * matrix[2 + k, 2 + m] * gamma[m, j]
+    return a[0, 0], a[0, 1], a[1, 1]

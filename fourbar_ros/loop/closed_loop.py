@@ -1,0 +1,83 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The closed loop in one process: what the nodes do over topics, call by call.
+
+The next tick comes when the command that answers the last one is there, so nothing is ever lost
+and time is simulated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..control import Control, Controller
+from ..device import Samples, Testbed
+from ..estimation import Estimate, Estimator
+from ..mechanism import FLYWHEEL_NAMES, LINK_NAMES
+
+FIRST_STAMP_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Everything of one tick; without estimate or control while the estimator is starting."""
+
+    samples: Samples
+    estimate: Estimate | None
+    control: Control | None
+
+
+class ClosedLoop:
+    """
+    A testbed with its estimator and controller.
+
+    :param testbed: the device behind its gate.
+    :param estimator, controller: made for the same mechanism.
+    """
+
+    def __init__(self, testbed: Testbed, estimator: Estimator, controller: Controller) -> None:
+        self.testbed = testbed
+        self.estimator = estimator
+        self.controller = controller
+        self._next_ns = FIRST_STAMP_NS
+
+    def step(self) -> Step:
+        """
+        Go through one tick: device, estimator, controller, command.
+
+        :raises FourbarError: the device failed.
+        """
+        stamp_ns = self._next_ns
+        self._next_ns += self.testbed.device.period_ns
+        samples, _ = self.testbed.tick(stamp_ns, stamp_ns)
+        self.testbed.published(stamp_ns, 0)
+        self.controller.device_armed(self.testbed.gate.armed)
+        for sample in samples.links:
+            self.estimator.measure(
+                sample.stamp_ns, [LINK_NAMES[link] for link in sample.links], list(sample.angles))
+        estimate = self.estimator.tick(stamp_ns, list(samples.wheels.speeds))
+        if estimate is None:
+            return Step(samples, None, None)
+        control = self.controller.tick(
+            stamp_ns, estimate.link_angles, estimate.link_rates, samples.wheels.speeds,
+            samples.wheels.efforts)
+        self.testbed.command(stamp_ns, FLYWHEEL_NAMES, (), (), list(control.torques), stamp_ns)
+        return Step(samples, estimate, control)
+
+    def arm(self) -> tuple[bool, str]:
+        """Arm the testbed at the last tick."""
+        stamp_ns = self._next_ns - self.testbed.device.period_ns
+        return self.testbed.arm(stamp_ns, stamp_ns, ())

@@ -1,0 +1,37 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Angles on the circle."""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .parameters import Array
+
+
+def wrap(angle: float) -> float:
+    """Bring an angle [rad] into (-pi, pi]."""
+    return float(wrap_angles(angle))
+
+
+def wrap_angles(angles: ArrayLike) -> Array:
+    """Bring angles [rad] of any shape into (-pi, pi]; what is there already stays bit for bit."""
+    given = np.asarray(angles, dtype=float)
+    wrapped = pi - (pi - given) % (2.0 * pi)
+    inside = (given > -pi) & (given <= pi)
+    return np.where(inside, given, np.where(wrapped <= -pi, pi, wrapped))

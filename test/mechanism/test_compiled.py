@@ -1,0 +1,172 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Compiled code is kept between processes, but never longer than it is right."""
+
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+from fourbar_ros.mechanism import compiled
+import pytest
+
+CALLER = """
+from .compiled import kernel
+from ..plant.callee import factor
+
+
+@kernel
+def scaled(x):
+    return factor() * x
+
+
+@kernel(parallel=False, fastmath=True)
+def inverse(x):
+    return 1.0 / x
+"""
+CALLEE = """
+from ..mechanism.compiled import kernel
+
+
+@kernel
+def factor():
+    return {factor}
+"""
+PROGRAM = """
+import json
+import tempfile
+tempfile.tempdir = {temporary!r}
+from fourbar_ros.mechanism.caller import inverse, scaled
+from fourbar_ros.mechanism.compiled import cache_directory
+import numba
+print(json.dumps({{
+    'scaled': scaled(2.0), 'inverse': inverse(0.0), 'directory': str(cache_directory()),
+    'loaded': sum(scaled.stats.cache_hits.values()), 'numba': numba.config.CACHE_DIR}}))
+"""
+NOWHERE = '/dev/null/nowhere'  # below a file, so that not even root can write there
+
+
+@pytest.fixture
+def package(tmp_path):
+    """Make a tiny fourbar_ros whose kernels call across rooms."""
+    root = tmp_path / 'tree' / 'fourbar_ros'
+    for room in compiled.ROOMS:
+        (root / room).mkdir(parents=True)
+        (root / room / '__init__.py').touch()
+    (root / '__init__.py').touch()
+    source = Path(compiled.__file__).read_text()
+    (root / 'mechanism' / 'compiled.py').write_text(source)
+    (root / 'mechanism' / 'caller.py').write_text(CALLER)
+    (root / 'plant' / 'callee.py').write_text(CALLEE.format(factor=3.0))
+    return root
+
+
+@pytest.fixture
+def run(package, tmp_path):
+    """Return a function that runs the kernels in a fresh process with one place to cache in."""
+    def run(temporary=str(tmp_path), **environment):
+        inherited = {key: value for key, value in os.environ.items()
+                     if not key.startswith('NUMBA_') and key != 'XDG_CACHE_HOME'}
+        result = subprocess.run(
+            [sys.executable, '-c', PROGRAM.format(temporary=temporary)],
+            cwd='/', capture_output=True, text=True, env={
+                **inherited, 'HOME': str(tmp_path / 'home'), 'PYTHONPATH': str(package.parent),
+                **environment})
+        assert result.returncode == 0, result.stderr
+        return {'notes': result.stderr.splitlines(), **json.loads(result.stdout)}
+    return run
+
+
+def test_second_process_loads_what_the_first_compiled(run):
+    assert run()['loaded'] == 0
+    assert run()['loaded'] == 1
+
+
+def test_edited_callee_in_another_module_is_seen(run, package):
+    assert run()['scaled'] == 6.0
+    callee = package / 'plant' / 'callee.py'
+    times = callee.stat()
+    callee.write_text(CALLEE.format(factor=5.0))
+    # Same size and same time: only the content can tell.
+    os.utime(callee, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert run()['scaled'] == 10.0
+
+
+def test_division_by_zero_is_inf_as_in_numpy(run):
+    assert run()['inverse'] == float('inf')
+
+
+def test_nothing_is_written_beside_the_sources(run, package):
+    run()
+    assert not list(package.rglob('*.nbi'))
+
+
+def test_cache_is_in_the_users_cache_folder(run, tmp_path):
+    home = Path(run()['directory'])
+    assert home.parent == tmp_path / 'home' / '.cache' / 'fourbar_ros'
+    xdg = Path(run(XDG_CACHE_HOME=str(tmp_path / 'xdg'))['directory'])
+    assert xdg == tmp_path / 'xdg' / 'fourbar_ros' / home.name
+    assert list(xdg.rglob('*.nbi'))
+
+
+def test_numba_cache_dir_of_the_user_wins(run, tmp_path):
+    chosen = tmp_path / 'chosen'
+    assert run(NUMBA_CACHE_DIR=str(chosen))['directory'] == str(chosen)
+    assert list(chosen.rglob('*.nbi'))
+
+
+def test_other_code_keeps_its_own_cache_folder(run, tmp_path):
+    assert run()['numba'] == ''
+    assert run(NUMBA_CACHE_DIR=str(tmp_path))['numba'] == str(tmp_path)
+
+
+@pytest.mark.parametrize('variables', [
+    {'HOME': NOWHERE, 'XDG_CACHE_HOME': NOWHERE}, {'NUMBA_CACHE_DIR': NOWHERE}])
+def test_without_a_writable_cache_a_temporary_folder_serves(run, tmp_path, variables):
+    first, second = run(**variables), run(**variables)
+    assert Path(first['directory']).is_relative_to(tmp_path / f'fourbar_ros-{os.getuid()}')
+    assert len(first['notes']) == 1 and first['directory'] in first['notes'][0]
+    assert second['loaded'] == 1
+
+
+def test_temporary_folder_that_others_can_write_to_is_not_used(run, tmp_path):
+    trap = tmp_path / f'fourbar_ros-{os.getuid()}'
+    trap.mkdir()
+    trap.chmod(0o777)
+    directory = Path(run(HOME=NOWHERE)['directory'])
+    assert not directory.is_relative_to(trap)
+    assert not list(trap.iterdir())
+
+
+def test_with_nothing_writable_it_still_works(run):
+    result = run(temporary=NOWHERE, HOME=NOWHERE, XDG_CACHE_HOME=NOWHERE)
+    assert result['scaled'] == 6.0
+    assert result['directory'] == 'None'
+    assert len(result['notes']) == 1 and 'every start compiles' in result['notes'][0]
+
+
+def test_folders_unused_for_long_are_dropped_and_others_kept(run, tmp_path):
+    cache = tmp_path / 'home' / '.cache' / 'fourbar_ros'
+    long_ago = 1.6e9
+    for name in ('0123456789abcdef', 'fedcba9876543210', 'not ours'):
+        (cache / name).mkdir(parents=True)
+    for name in ('0123456789abcdef', 'not ours'):
+        os.utime(cache / name, (long_ago, long_ago))
+    in_use = Path(run()['directory'])
+    os.utime(in_use, (long_ago, long_ago))
+    assert run()['loaded'] == 1
+    assert {path.name for path in cache.iterdir()} == {
+        'fedcba9876543210', 'not ours', in_use.name}

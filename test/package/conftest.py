@@ -1,0 +1,75 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Copies of the tree to install from, and children that know nothing of this installation."""
+
+from concurrent.futures import ThreadPoolExecutor
+import os
+from pathlib import Path
+import shutil
+import subprocess
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+LEAKS = (
+    'AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'LD_LIBRARY_PATH',
+    'PYTHONHOME', 'PYTHONPATH', 'RMW_IMPLEMENTATION', 'VIRTUAL_ENV',
+    '_ROS_WHEELS_BOOTSTRAP_COMPLETE',
+)
+
+
+@pytest.fixture(scope='session')
+def copy_tree():
+    """Return a function that copies the tree to a new folder, without what .gitignore lists."""
+    ignored = [line.rstrip('/') for line in (ROOT / '.gitignore').read_text().split()]
+
+    def copy(target):
+        return shutil.copytree(
+            ROOT, target, symlinks=True, ignore=shutil.ignore_patterns('.git', *ignored))
+    return copy
+
+
+@pytest.fixture(scope='session')
+def check():
+    """
+    Return a function that runs a command, which must succeed, and returns what it printed.
+
+    What the wheels and a sourced ROS leave in the environment is dropped.
+    """
+    def check(*command, cwd='/', **variables):
+        inherited = {key: value for key, value in os.environ.items() if key not in LEAKS}
+        result = subprocess.run(
+            [str(part) for part in command], cwd=cwd, env={**inherited, **variables},
+            capture_output=True, text=True, timeout=400)
+        assert result.returncode == 0, f'{command}\n{result.stdout}\n{result.stderr}'
+        return result.stdout
+    return check
+
+
+@pytest.fixture(scope='session')
+def executables():
+    """Return the names for `ros2 run`."""
+    return sorted(path.name for path in (ROOT / 'scripts').glob('[!_]*'))
+
+
+@pytest.fixture(scope='session')
+def check_help(check):
+    """Return a function that asks each of some executables for --help, which must be printed."""
+    def check_help(*prefix, folder, names, **options):
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            texts = pool.map(
+                lambda name: check(*prefix, folder / name, '--help', **options), names)
+            assert [name for name, text in zip(names, texts) if 'usage' not in text] == []
+    return check_help

@@ -1,0 +1,83 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A colcon workspace builds, finds, runs and tests the package, linked or copied."""
+
+import os
+from pathlib import Path
+import sys
+from xml.etree import ElementTree
+
+import pytest
+
+pytestmark = pytest.mark.package
+
+CASE = Path(__file__).parents[1] / 'data' / 'paper_pair_ac.json'
+COLCON = (sys.executable, '-m', 'colcon', '--log-base', 'log')
+# Runs what follows in the environment of the workspace.
+SOURCED = ('sh', '-c', '. install/setup.sh && exec "$@"', 'sh')
+# The Python that ran colcon must also be the one that `env python3` finds.
+PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']])
+
+
+@pytest.fixture(scope='module', params=['copied', 'linked'])
+def workspace(request, tmp_path_factory, copy_tree, check):
+    """Build a copy of the tree in a workspace of its own, and return the workspace."""
+    workspace = tmp_path_factory.mktemp(request.param)
+    copy_tree(workspace / 'src' / 'fourbar_ros')
+    options = ['--symlink-install'] if request.param == 'linked' else []
+    check(*COLCON, 'build', *options, cwd=workspace, PATH=PATH)
+    return workspace
+
+
+@pytest.fixture(scope='module')
+def folder(workspace):
+    """Return the folder where `ros2 run` looks for executables."""
+    return workspace / 'install' / 'fourbar_ros' / 'lib' / 'fourbar_ros'
+
+
+def test_every_executable_is_where_ros2_run_looks(folder, executables):
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*executables, 'fourbar'])
+    assert all(os.access(path, os.X_OK) for path in folder.iterdir())
+
+
+def test_every_executable_has_help(workspace, folder, executables, check_help):
+    names = [*executables, 'fourbar']
+    check_help(*SOURCED, folder=folder, names=names, cwd=workspace, PATH=PATH)
+
+
+def test_simulate_writes_a_table(workspace, folder, check):
+    check(*SOURCED, folder / 'simulate', CASE, '-o', 'out.csv', cwd=workspace, PATH=PATH)
+    header, *rows = (workspace / 'out.csv').read_text().splitlines()
+    assert header.startswith('t,link_a') and len(rows) > 1
+
+
+def test_code_and_presets_are_those_of_the_workspace(workspace, check):
+    code = ('import fourbar_ros; from fourbar_ros.configuration import config_file as f; '
+            'print(fourbar_ros.__file__); print(f("mechanism", "paper"))')
+    printed = check(*SOURCED, sys.executable, '-c', code, cwd=workspace, PATH=PATH)
+    module, preset = map(Path, printed.splitlines())
+    assert module.is_relative_to(workspace)
+    assert preset.is_relative_to(workspace) and preset.is_file()
+
+
+def test_colcon_test_runs_tests_that_pass(workspace, check):
+    results = workspace / 'build' / 'fourbar_ros' / 'pytest.xml'
+    # A quick part: all others ran against the installed package already.
+    check(*COLCON, 'test', '--return-code-on-test-failure', '--pytest-args',
+          '-m', 'not package and not node', 'test/test_configuration.py',
+          cwd=workspace, PATH=PATH)
+    suite = ElementTree.parse(results).getroot().find('testsuite')
+    assert int(suite.get('tests')) > 10
+    assert (suite.get('failures'), suite.get('errors')) == ('0', '0')
