@@ -37,12 +37,15 @@ from fourbar_ros.mechanism import (
 )
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 import numpy as np
 
 LETTERS = 'abcd'
 INSTANTS = 7
 # What there is to see before the setpoint: that the loop was at rest.
 LEAD_S = 0.5
+# Half the width of the close-up of the angles.
+MAGNIFIED_NS = 100_000_000
 NIS_WINDOW_S = 1.0
 NIS_BAND = (0.025, 0.975)
 
@@ -91,10 +94,11 @@ def linkage(view: View) -> Figure:
         raise BagError('the link angles leave out a link')
     speeds = _absolute_speeds(view, links)[rows]
     fastest = float(np.nanmax(np.abs(speeds), initial=0.0)) if len(speeds) else 0.0
-    reach = 1.12 * float(np.max(np.linalg.norm(joint_positions(
+    reach = 1.06 * float(np.max(np.linalg.norm(joint_positions(
         view.mechanism, np.vstack([poses.position, view.motion.goal])), axis=-1)))
 
-    figure = Figure(figsize=(style.WIDTH_IN, 2.25), layout='constrained')
+    figure = Figure(figsize=(style.WIDTH_IN, 1.75),
+                    layout=ConstrainedLayoutEngine(w_pad=0.0, h_pad=0.02, wspace=0.0))
     for index, axes in enumerate(figure.subplots(1, INSTANTS, sharex=True, sharey=True)):
         axes.set_axis_off()
         axes.set_aspect('equal')
@@ -168,13 +172,32 @@ def angles(view: View) -> Figure:
                 series.select(LINK_NAMES).position[:, link]))
             axes.plot(time, angle, label=label, **{**shown, **look})
         _goal_line(view, axes, link, reference)
+        _magnify(view, axes, link, curves, reference)
         view.mark_step(axes)
         axes.set_title(f'link {LETTERS[link]}', color=LINK_COLOURS[link], fontweight='bold')
         axes.set_ylabel('angle [deg]' if link % 2 == 0 else '')
         axes.set_xlabel('time since setpoint [s]' if link > 1 else '')
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside upper right', ncols=len(labels))
+    figure.legend(handles, labels, loc='outside upper right', ncols=len(labels), markerscale=3.0)
     return figure
+
+
+def _magnify(view: View, axes: Axes, link: int, curves: list[tuple[str, JointSeries, Any]],
+             reference: JointSeries) -> None:
+    """Show the middle of the step close up: on the scale of the motion all curves are one."""
+    middle_ns = (view.motion.start_ns + view.motion.step_end_ns) // 2
+    if view.motion.end_ns <= middle_ns + MAGNIFIED_NS:
+        return
+    inset = axes.inset_axes((0.60, 0.12, 0.38, 0.50))
+    near = (middle_ns - MAGNIFIED_NS, middle_ns + MAGNIFIED_NS)
+    _raw_samples(view, inset, link, reference, near)
+    for _, series, look in curves:
+        shown = series.between(*near).select(LINK_NAMES)
+        inset.plot(view.seconds(shown.stamp_ns), np.degrees(shown.position[:, link]),
+                   **{'color': LINK_COLOURS[link], **look})
+    inset.set_xlim(*view.seconds(np.array(near)))
+    inset.locator_params(nbins=3)
+    inset.tick_params(labelsize=7.5)
 
 
 def _goal_line(view: View, axes: Axes, link: int, reference: JointSeries) -> None:
@@ -185,15 +208,18 @@ def _goal_line(view: View, axes: Axes, link: int, reference: JointSeries) -> Non
                  linestyle=(0, (6, 2)), label='goal', zorder=1.5)
 
 
-def _raw_samples(view: View, axes: Axes, link: int, reference: JointSeries) -> None:
+def _raw_samples(view: View, axes: Axes, link: int, reference: JointSeries,
+                 near: tuple[int, int] | None = None) -> None:
     if not view.recording.has('link_angles'):
         return
     raw = view.series('link_angles').select(LINK_NAMES)
+    if near is not None:
+        raw = raw.between(*near)
     # Raw angles lie in (-pi, pi]: show them on the turn that the reference is on.
     nearby = np.interp(raw.stamp_ns, reference.stamp_ns, reference.position[:, link])
     angle = nearby + wrap(raw.position[:, link] - nearby)
-    time, angle = decimate(view.seconds(raw.stamp_ns), np.degrees(angle), bins=250)
-    axes.plot(time, angle, linestyle='none', marker='.', markersize=3.0, alpha=0.45,
+    time, angle = style.thin_out(view.seconds(raw.stamp_ns), np.degrees(angle), 500)
+    axes.plot(time, angle, linestyle='none', marker='.', markersize=3.5, alpha=0.5,
               color=COLOURS['muted'], markeredgewidth=0, label='raw sample')
 
 
@@ -211,12 +237,12 @@ def errors(view: View) -> Figure:
         _sigma_band(view, axes, link)
         time, angle = decimate(view.seconds(error.stamp_ns), np.degrees(error.difference[:, link]))
         axes.plot(time, angle, color=LINK_COLOURS[link], linewidth=1.0,
-                  label='estimate - ground truth')
+                  label='estimate − ground truth')
         view.mark_step(axes)
-        axes.set_title(f'estimate error of link {LETTERS[link]}', color=LINK_COLOURS[link],
+        axes.set_title(f'Estimate error of link {LETTERS[link]}', color=LINK_COLOURS[link],
                        fontweight='bold')
         axes.set_ylabel('error [deg]' if link % 2 == 0 else '')
-    panels[1, 0].legend(loc='upper right', ncols=2)
+    style.legend_above(panels[1, 1])
     for axes in panels[-1]:
         axes.set_xlabel('time since setpoint [s]')
     return figure
@@ -231,15 +257,15 @@ def _tracking_panels(view: View, actual: list[tuple[str, Paired]],
             best = word == actual[-1][0]
             time, angle = decimate(view.seconds(error.stamp_ns),
                                    np.degrees(error.difference[:, link]))
-            axes.plot(time, angle, label=f'{word} - reference', linewidth=1.4 if best else 0.8,
+            axes.plot(time, angle, label=f'{word} − reference', linewidth=1.4 if best else 0.8,
                       color=LINK_COLOURS[link] if best else COLOURS['muted'])
         axes.axhline(0.0, color=COLOURS['muted'], linewidth=0.7)
         view.mark_step(axes)
-        axes.set_title(f'tracking error of link {LETTERS[link]}', color=LINK_COLOURS[link],
+        axes.set_title(f'Tracking error of link {LETTERS[link]}', color=LINK_COLOURS[link],
                        fontweight='bold')
         axes.set_xlabel('time since setpoint [s]' if rows == 1 else '')
     panels[0, 0].set_ylabel('error [deg]')
-    panels[0, 0].legend(loc='upper right', ncols=2)
+    style.legend_above(panels[0, 1])
     return figure, panels
 
 
@@ -321,7 +347,7 @@ def energy(view: View) -> Figure:
         reasons.append(error)
     if not curves:
         raise BagError('; '.join(map(str, reasons)))
-    titles = (('Flywheel energy, paper eq. 7', 'J'), ('Paper eq. 9, accumulated', 'J s'),
+    titles = (('Flywheel energy, eq. 7', 'J'), ('Eq. 9, accumulated', 'J s'),
               ('Work of the motors, accumulated', 'J'))
     for column, (axes, (title, unit)) in enumerate(zip(panels, titles)):
         chosen = [curve for curve in curves if curve[0] == column]
@@ -335,7 +361,7 @@ def energy(view: View) -> Figure:
         axes.set_xlabel('time since setpoint [s]')
         axes.set_ylim(bottom=0.0)
     if len([curve for curve in curves if curve[0] == 0]) > 1:
-        panels[0].legend(loc='upper right')
+        panels[0].legend(loc='upper right', handlelength=1.2)
     return figure
 
 
@@ -349,10 +375,10 @@ def timing(view: View) -> Figure:
     period = float(np.median(np.diff(series.stamp_ns))) * 1e-6 if len(series) > 1 else np.nan
     figure = Figure(figsize=(style.WIDTH_IN, 3.0), layout='constrained')
     over_time, distribution = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
-    time, trip = decimate(view.seconds(series.stamp_ns), trips, bins=500)
+    time, trip = style.thin_out(view.seconds(series.stamp_ns), trips, 1200)
     over_time.plot(time, trip, linestyle='none', marker='.', markersize=3.5, alpha=0.6,
                    color=LINK_COLOURS[0], markeredgewidth=0)
-    over_time.set_yscale('log')
+    style.log_ticks(over_time)
     bins = np.geomspace(0.9 * np.min(trips[known]), 1.1 * np.max(trips[known]), 41)
     distribution.hist(trips[known], bins=bins, orientation='horizontal', alpha=0.75,
                       color=LINK_COLOURS[0])
@@ -368,23 +394,18 @@ def timing(view: View) -> Figure:
     distribution.set_title('Distribution')
     distribution.set_xlabel('ticks')
     view.mark_step(over_time)
-    _plain_log_ticks(over_time)
     return figure
 
 
 def _name_levels(axes: Axes, trips: Floats, period: float) -> None:
     p50, p99 = np.percentile(trips, [50, 99])
+    axes.set_xlim(right=1.9 * axes.get_xlim()[1])
     for value, text, colour in ((p50, f'median {p50:.2f} ms', 'ink'),
                                 (p99, f'99 % {p99:.2f} ms', 'ink'),
                                 (period, f'period {period:.3g} ms', 'limit')):
         axes.annotate(text, (1.0, value), xycoords=('axes fraction', 'data'), xytext=(0, 2),
                       textcoords='offset points', ha='right', va='bottom', fontsize=8.0,
                       color=COLOURS[colour])
-
-
-def _plain_log_ticks(axes: Axes) -> None:
-    axes.yaxis.set_major_formatter(lambda value, _: f'{value:g}')
-    axes.yaxis.set_minor_formatter(lambda value, _: '')
 
 
 def innovations(view: View) -> Figure:
@@ -402,15 +423,15 @@ def innovations(view: View) -> Figure:
     above, below = figure.subplots(2, 1, sharex=True)
     values = np.degrees(series.select(LINK_NAMES).position)
     for link in range(4):
-        above.plot(*decimate(time, values[:, link], bins=200), linestyle='none', marker='.',
+        above.plot(*style.thin_out(time, values[:, link], 400), linestyle='none', marker='.',
                    markersize=3.5, alpha=0.6, markeredgewidth=0, color=LINK_COLOURS[link],
                    label=f'link {LETTERS[link]}')
     above.set_title('Innovation: measured minus predicted angle')
     above.set_ylabel('[deg]')
-    above.legend(loc='upper right', ncols=4, markerscale=2.5)
+    style.legend_above(above, 2.5)
 
-    below.plot(*decimate(time[used], nis[used] / degrees[used], bins=300), linestyle='none',
-               marker='.', markersize=3.0, alpha=0.35, markeredgewidth=0, color=COLOURS['muted'],
+    below.plot(*style.thin_out(time[used], nis[used] / degrees[used], 900), linestyle='none',
+               marker='.', markersize=3.5, alpha=0.4, markeredgewidth=0, color=COLOURS['muted'],
                label='each measurement')
     centre, mean, total = _window_means(time[used], nis[used], degrees[used])
     low, high = (2.0 * gammaincinv(total / 2.0, share) / total for share in NIS_BAND)
@@ -419,13 +440,12 @@ def innovations(view: View) -> Figure:
     below.plot(centre, mean, color=COLOURS['ink'], linewidth=1.5,
                label=f'mean over {NIS_WINDOW_S:g} s')
     below.axhline(1.0, color=LINK_COLOURS[2], linewidth=1.0)
-    below.set_yscale('log')
+    style.log_ticks(below)
     below.set_ylim(min(0.3, 0.8 * float(np.min(mean))), max(5.0, 1.25 * float(np.max(mean))))
-    _plain_log_ticks(below)
     below.set_title('Normalized innovation squared per degree of freedom')
     below.set_ylabel('NIS / degrees of freedom')
     below.set_xlabel('time since setpoint [s]')
-    below.legend(loc='upper right', ncols=3)
+    style.legend_above(below, 2.5)
     view.mark_step(below)
     return figure
 

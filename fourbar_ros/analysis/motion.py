@@ -69,7 +69,7 @@ class Motion:
 
     def seconds(self, stamp_ns: Nanoseconds) -> Floats:
         """Return the time since the start [s]."""
-        return (stamp_ns - self.start_ns) * 1e-9
+        return (stamp_ns - self.start_ns).astype(np.float64) * 1e-9
 
 
 @dataclass(frozen=True)

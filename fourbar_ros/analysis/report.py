@@ -44,8 +44,8 @@ SECTIONS = (
      'linkage (+) at the origin; dashed: the goal. The arc around each wheel is its absolute '
      'speed, counter-clockwise from the top, as a share of the largest in this motion.'),
     ('angles', 'Link angles',
-     'All curves should lie on one another; the next figure shows by how little they differ. '
-     'Dotted verticals here and below: setpoint and end of the step.'),
+     'The insets magnify 0.2 s at the middle of the step. Dotted verticals, here and below: '
+     'setpoint and end of the step.'),
     ('errors', 'Tracking and estimate errors',
      'Above, how far links a and b are from the reference: coloured in truth, grey as the '
      'controller sees it. Below, how wrong the estimate is, over the band of two standard '
@@ -69,8 +69,8 @@ TILES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
     ('tracking.rms_rad', 'tracking error, rms', lambda v: f'{np.degrees(v):.3g}°'),
     ('tracking.final_error_rad', 'final error', lambda v: f'{np.degrees(v):.3g}°'),
     ('estimate.rms_error_rad', 'estimate error, rms', lambda v: f'{np.degrees(v):.3g}°'),
-    ('flywheel.peak_speed_rad_s', 'peak wheel speed', lambda v: f'{v:.4g} rad/s'),
-    ('loop.round_trip_p99_ms', 'round trip, 99 %', lambda v: f'{v:.3g} ms'),
+    ('flywheel.peak_speed_rad_s', 'peak wheel speed', lambda v: f'{v:.3g} <small>rad/s</small>'),
+    ('loop.round_trip_p99_ms', 'round trip, 99 %', lambda v: f'{v:.3g} <small>ms</small>'),
     ('loop.lost', 'lost ticks', lambda v: f'{v:d}'),
 )
 # Without ground truth the estimate has to do.
@@ -222,6 +222,7 @@ h2 { font-size: 1.15rem; margin: 2.6rem 0 .6rem; }
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(9rem, 1fr)); gap: .6rem; }
 .tiles div { background: var(--tile); border-radius: .5rem; padding: .7rem .9rem; }
 .tiles b { display: block; font-size: 1.3rem; font-variant-numeric: tabular-nums; }
+.tiles small { font-size: .95rem; font-weight: 500; }
 .tiles span { font-size: .82rem; }
 figure { margin: 0; }
 svg { display: block; width: 100%; height: auto; }

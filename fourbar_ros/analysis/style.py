@@ -30,6 +30,7 @@ from fourbar_ros.analysis.bags import Floats
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 import numpy as np
 from numpy.typing import NDArray
 
@@ -137,6 +138,22 @@ def decimate(x: Floats, y: Floats, bins: int = BINS) -> tuple[Floats, Floats]:
     return x[kept], y[kept]
 
 
+def thin_out(x: Floats, y: Floats, count: int) -> tuple[Floats, Floats]:
+    """
+    Thin out scattered samples evenly, so that their density stays, and keep the extremes.
+
+    :param x: (n,) ascending; NaN in y is left out.
+    :returns: about count points, in order.
+    """
+    known = np.isfinite(y)
+    x, y = x[known], y[known]
+    if len(x) <= count:
+        return x, y
+    peaks = decimate(np.arange(len(x), dtype=float), y, count // 20)[0].astype(int)
+    kept = np.union1d(np.linspace(0, len(x) - 1, count).astype(int), peaks)
+    return x[kept], y[kept]
+
+
 def si_scale(largest: float) -> tuple[float, str]:
     """Return the factor and the prefix with which a number up to this reads well."""
     for factor, prefix in ((1.0, ''), (1e3, 'm'), (1e6, 'µ'), (1e9, 'n')):
@@ -152,10 +169,28 @@ def label_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
     :param ends: (last y, text, colour) of each curve.
     """
     low, high = axes.get_ylim()
-    apart = 0.075 * (high - low)
-    below = -np.inf
-    for y, text, colour in sorted(ends):
-        below = max(y, below + apart)
-        axes.annotate(text, (1.0, below), xycoords=('axes fraction', 'data'), xytext=(4, 0),
-                      textcoords='offset points', va='center', color=colour, fontweight='bold',
-                      annotation_clip=False)
+    apart = 0.085 * (high - low)
+    ends = sorted(ends)
+    places = [ends[0][0]] if ends else []
+    for y, _, _ in ends[1:]:
+        places.append(max(y, places[-1] + apart))
+    shift = float(np.mean([end[0] for end in ends]) - np.mean(places)) if ends else 0.0
+    for (_, text, colour), place in zip(ends, places):
+        axes.annotate(text, (1.0, place + shift), xycoords=('axes fraction', 'data'),
+                      xytext=(4, 0), textcoords='offset points', va='center', color=colour,
+                      fontweight='bold', annotation_clip=False)
+
+
+def legend_above(axes: Axes, markerscale: float = 1.0) -> None:
+    """Put the legend beside the title, where it hides no curve."""
+    labels = axes.get_legend_handles_labels()[1]
+    axes.legend(loc='lower right', bbox_to_anchor=(1.0, 1.0), ncols=len(labels),
+                borderaxespad=0.1, markerscale=markerscale)
+
+
+def log_ticks(axes: Axes) -> None:
+    """Label a logarithmic y axis at 1, 2, 5, 10, ... in plain numbers."""
+    axes.set_yscale('log')
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(lambda value, _: f'{value:g}')
+    axes.yaxis.set_minor_locator(NullLocator())

@@ -1,0 +1,132 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Quality of service, and messages that are made once and written in place."""
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+
+# Best-effort publishers are invisible to default subscribers, so everything is offered reliable.
+RELIABLE = QoSProfile(depth=10)
+SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+# A message on a wrong input at most so often [s].
+LOG_PERIOD = 1.0
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+def stamp_of(message):
+    """Return the stamp of a message [ns]."""
+    stamp = message.header.stamp
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
+
+
+class JointStatePublisher:
+    """
+    Publish a JointState with the same names every time, reusing one message.
+
+    :param fields: those of position, velocity, effort that are used; the others stay empty.
+    """
+
+    def __init__(self, node, topic, names, fields=('position', 'velocity')):
+        self._publisher = node.create_publisher(JointState, topic, RELIABLE)
+        self._fields = fields
+        self._message = JointState()
+        self._set_names(tuple(names))
+
+    def _set_names(self, names):
+        self._names = names
+        self._message.name = list(names)
+        self._views = []
+        for field in self._fields:
+            setattr(self._message, field, [0.0] * len(names))
+            self._views.append(np.frombuffer(getattr(self._message, field)))
+
+    def publish(self, stamp_ns, *values, names=None):
+        """
+        Send one message.
+
+        :param values: an array for each field.
+        :param names: instead of those given before, for messages that leave some out.
+        """
+        if names is not None and names != self._names:
+            self._set_names(names)
+        stamp = self._message.header.stamp
+        stamp.sec, stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+        for view, value in zip(self._views, values):
+            view[:] = value
+        self._publisher.publish(self._message)
+
+
+def status_message(name, hardware, level, summary, values):
+    """Make a DiagnosticStatus; `values` is a dict of anything that has a text."""
+    return DiagnosticStatus(
+        level=level, name=name, message=summary, hardware_id=hardware,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+
+
+class Diagnostics:
+    """
+    Publish one status on /diagnostics at 1 Hz, and at once when its summary changes.
+
+    :param collect: returns level, summary and a dict of values.
+    """
+
+    def __init__(self, node, hardware, collect, guard):
+        self._node = node
+        self._hardware = hardware
+        self._collect = collect
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', RELIABLE)
+        self._last = None
+        node.create_timer(1.0, guard(self.publish), clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def changed(self):
+        """Publish if level or summary are not what they were."""
+        if self._collect()[:2] != self._last:
+            self.publish()
+
+    def publish(self):
+        """Publish now."""
+        level, summary, values = self._collect()
+        self._last = level, summary
+        array = DiagnosticArray()
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        name = self._node.get_fully_qualified_name().lstrip('/')
+        array.status = [status_message(name, self._hardware, level, summary, values)]
+        self._publisher.publish(array)
+
+
+class RareLog:
+    """Log warnings at most once per LOG_PERIOD; rclpy's own throttle costs 0.3 ms a call."""
+
+    def __init__(self, node):
+        self._logger = node.get_logger()
+        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._last_ns = None
+        self._held = 0
+
+    def warn(self, message):
+        """Log, or count as held back."""
+        now_ns = self._clock.now().nanoseconds
+        if self._last_ns is not None and now_ns - self._last_ns < LOG_PERIOD * 1e9:
+            self._held += 1
+            return
+        more = f' ({self._held} more since the last message)' if self._held else ''
+        self._logger.warning(message + more)
+        self._last_ns, self._held = now_ns, 0

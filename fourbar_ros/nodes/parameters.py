@@ -1,0 +1,120 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One table per node lists its parameters; declaring, checking and documents come from it."""
+
+from dataclasses import dataclass
+
+from fourbar_ros.errors import FourbarError
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+
+
+class ParameterError(FourbarError):
+    """A parameter value that is refused."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """
+    One row of a node's table.
+
+    :param default: also gives the type; a float takes whole numbers too.
+    :param unit: SI, or '' for none.
+    :param limits: smallest and largest allowed value, both inclusive.
+    :param choices: all allowed values.
+    :param live: may be changed at run time.
+    """
+
+    name: str
+    default: object
+    unit: str
+    meaning: str
+    limits: tuple = None
+    choices: tuple = None
+    live: bool = False
+
+    def checked(self, value):
+        """
+        Return the value in the parameter's type.
+
+        :raises ParameterError: wrong type, out of range, not one of the choices.
+        """
+        kind = type(self.default)
+        if kind is float and type(value) is int:
+            value = float(value)
+        if type(value) is not kind:
+            raise ParameterError(
+                f'parameter {self.name} must be of type {kind.__name__}, got {value!r}')
+        if self.choices is not None and value not in self.choices:
+            raise ParameterError(
+                f'parameter {self.name} must be one of {", ".join(map(str, self.choices))}, '
+                f'got {value}')
+        # Written so that NaN fails.
+        if self.limits is not None and not self.limits[0] <= value <= self.limits[1]:
+            raise ParameterError(
+                f'parameter {self.name} must be between {self.limits[0]:g} and '
+                f'{self.limits[1]:g} {self.unit}'.rstrip() + f', got {value}')
+        return value
+
+
+def declare(node, table, changed=None):
+    """
+    Declare a table of parameters and read their first values.
+
+    :param changed: called with the dict of all values after a change at run time.
+    :returns: dict of values by name.
+    :raises ParameterError: a value given at start is refused.
+    """
+    rows = {row.name: row for row in table}
+    values = {}
+    for row in table:
+        given = node.declare_parameter(row.name, row.default, ParameterDescriptor(
+            description=f'{row.meaning} [{row.unit}]' if row.unit else row.meaning,
+            read_only=not row.live, dynamic_typing=True)).value
+        values[row.name] = row.checked(given)
+
+    def on_set(parameters):
+        new = dict(values)
+        for parameter in parameters:
+            if parameter.name in rows:
+                try:
+                    new[parameter.name] = rows[parameter.name].checked(parameter.value)
+                except ParameterError as error:
+                    return SetParametersResult(successful=False, reason=str(error))
+        if new != values:
+            values.update(new)
+            if changed is not None:
+                changed(values)
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(on_set)
+    return values
+
+
+def yaml_of(tables):
+    """
+    Write the parameters file of several nodes.
+
+    :param tables: dict of tables by node name.
+    :returns: text of a file for `--params-file`, valid in any namespace.
+    """
+    lines = ['# Parameters of all nodes with their defaults, for --ros-args --params-file FILE.',
+             '# The keys hold in any namespace.']
+    for node, table in tables.items():
+        lines += ['', f'/**/{node}:', '  ros__parameters:']
+        for row in table:
+            unit = f' [{row.unit}]' if row.unit else ''
+            value = f"'{row.default}'" if isinstance(row.default, str) else row.default
+            lines.append(f'    {row.name}: {value}  # {row.meaning}{unit}')
+    return '\n'.join(lines) + '\n'

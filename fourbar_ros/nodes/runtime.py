@@ -1,0 +1,156 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How every node starts, runs and ends."""
+
+import argparse
+from importlib.metadata import PackageNotFoundError, version
+import os
+import signal
+import sys
+
+from fourbar_ros.errors import FourbarError
+import rclpy
+from rclpy.exceptions import (
+    InvalidNamespaceException, InvalidNodeNameException, InvalidTopicNameException,
+    ParameterException,
+)
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+try:
+    from rclpy.experimental.events_executor import EventsExecutor
+except ImportError:
+    EventsExecutor = None
+
+OLDEST_RCLPY = (7, 1, 4)
+
+# The executor of these wheels hangs in any wait without a time limit [s].
+SPIN_TIMEOUT = 0.2
+
+
+class RosError(FourbarError):
+    """ROS is missing, foreign, or refused what it was asked."""
+
+
+class Runtime:
+    """
+    ROS of one process: context, executor, and signals that only raise a flag.
+
+    rclpy's own signal handling ends the context before anybody can send a last zero torque.
+    """
+
+    def __init__(self, ros_args=()):
+        check_environment()
+        self.stopping = False
+        self.failure = None
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._stop)
+        try:
+            rclpy.init(args=list(ros_args), signal_handler_options=SignalHandlerOptions.NO)
+        except Exception as error:  # noqa: B902 - rcl's errors have no common class
+            raise RosError(_first_line(error)) from None
+        self.executor = EventsExecutor()
+
+    def _stop(self, _number, _frame):
+        self.stopping = True
+
+    def guard(self, callback):
+        """Wrap a callback: an exception that leaves one would print FATAL and a traceback."""
+        def guarded(*args):
+            try:
+                return callback(*args)
+            except Exception as error:  # noqa: B902 - whatever it is, the node must end cleanly
+                self.failure = self.failure or error
+                return args[1] if len(args) > 1 else None
+        return guarded
+
+    def spin(self):
+        """Run callbacks until a signal or a failure; raises the failure."""
+        while not self.stopping and self.failure is None:
+            self.executor.spin_once(timeout_sec=SPIN_TIMEOUT)
+        if self.failure is not None:
+            raise self.failure
+
+    def shut_down(self):
+        """End ROS in this process."""
+        rclpy.try_shutdown()
+
+
+def run_node(make_node, name, description, argv):
+    """
+    Run one node until a signal.
+
+    :param make_node: called with the runtime, returns a node with a `close()`.
+    :param argv: what follows the executable's name.
+    :returns: exit code.
+    :raises RosError: bad arguments or no usable ROS.
+    """
+    argv = list(argv)
+    parser = argparse.ArgumentParser(
+        prog=f'fourbar {name}', description=description, usage=f'fourbar {name} [--ros-args ...]',
+        epilog='Parameters (-p name:=value, --params-file FILE), remapping (-r) and namespace '
+               '(-r __ns:=/lab) follow --ros-args. docs/topics.md lists topics and parameters, '
+               'with units.')
+    ros_free = remove_ros_args(args=[name, *argv])[1:]
+    parser.parse_args(ros_free)
+    runtime = Runtime(argv)
+    node = None
+    try:
+        node = make_node(runtime)
+        runtime.executor.add_node(node)
+        runtime.spin()
+    except (InvalidNamespaceException, InvalidNodeNameException, InvalidTopicNameException,
+            ParameterException) as error:
+        raise RosError(_first_line(error)) from None
+    finally:
+        if node is not None:
+            node.close()
+            node.destroy_node()
+        runtime.shut_down()
+    return 0
+
+
+def check_environment():
+    """
+    Refuse what would fail later with a message that nobody understands.
+
+    :raises RosError: foreign rclpy, unusable middleware, bad domain id.
+    """
+    try:
+        found = version('rclpy')
+    except PackageNotFoundError:
+        found = '0'
+    numbers = tuple(int(part) for part in found.split('.')[:3] if part.isdigit())
+    if EventsExecutor is None or numbers < OLDEST_RCLPY:
+        where = os.path.dirname(rclpy.__file__)
+        raise RosError(f'rclpy {found} in {where} is not that of ROS 2 Jazzy '
+                       f'(7.1.4 or later): is another ROS sourced?')
+    domain = os.environ.get('ROS_DOMAIN_ID', '')
+    if domain and not (domain.isdigit() and int(domain) <= 232):
+        raise RosError(f'ROS_DOMAIN_ID must be a whole number from 0 to 232, not {domain!r}')
+    try:
+        rclpy.get_rmw_implementation_identifier()
+    except Exception:  # noqa: B902
+        wanted = os.environ.get('RMW_IMPLEMENTATION', 'the default')
+        raise RosError(f'RMW_IMPLEMENTATION {wanted} cannot be loaded here') from None
+
+
+def steady_sleepless_print(message):
+    """Print a line at once, whatever stdout is connected to."""
+    print(message, file=sys.stdout, flush=True)
+
+
+def _first_line(error):
+    return ' '.join(str(error).split()) or type(error).__name__
