@@ -179,8 +179,7 @@ class Recording:
             found = [topic for topic in self.topics
                      if topic.endswith(f'/{name}') and not (longer and topic.endswith(longer))]
         if not found:
-            raise BagError(f'{self.path}: no topic {name} '
-                           f'(it has {", ".join(sorted(self.topics)) or "none"})')
+            raise BagError(f'{self.path}: no topic {name}')
         if len(found) > 1:
             raise _AmbiguousTopicError(
                 f'{self.path}: {name} could be {" or ".join(sorted(found))}: name the namespace')

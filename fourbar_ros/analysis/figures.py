@@ -26,7 +26,7 @@ from typing import Any
 from fourbar_ros.analysis import style
 from fourbar_ros.analysis.bags import BagError, Floats, JointSeries, Nanoseconds, Recording
 from fourbar_ros.analysis.metrics import flywheel_energy
-from fourbar_ros.analysis.motion import Motion, pair, Paired, wrap
+from fourbar_ros.analysis.motion import Motion, pair, Paired
 from fourbar_ros.analysis.style import COLOURS, decimate, LINK_COLOURS, LINK_DASHES
 from fourbar_ros.mechanism import (
     com_positions_in_table,
@@ -35,6 +35,7 @@ from fourbar_ros.mechanism import (
     LINK_NAMES,
     Mechanism,
 )
+from fourbar_ros.mechanism.angles import wrap_angles
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -46,6 +47,7 @@ INSTANTS = 7
 LEAD_S = 0.5
 # Half the width of the close-up of the angles.
 MAGNIFIED_NS = 100_000_000
+MAGNIFY_FROM_RAD = np.radians(5.0)
 NIS_WINDOW_S = 1.0
 NIS_BAND = (0.025, 0.975)
 
@@ -186,15 +188,19 @@ def _magnify(view: View, axes: Axes, link: int, curves: list[tuple[str, JointSer
              reference: JointSeries) -> None:
     """Show the middle of the step close up: on the scale of the motion all curves are one."""
     middle_ns = (view.motion.start_ns + view.motion.step_end_ns) // 2
-    if view.motion.end_ns <= middle_ns + MAGNIFIED_NS:
+    turn = float(view.motion.goal[link] - view.motion.initial[link])
+    if view.motion.end_ns <= middle_ns + MAGNIFIED_NS or abs(turn) < MAGNIFY_FROM_RAD:
         return
-    inset = axes.inset_axes((0.60, 0.12, 0.38, 0.50))
+    # In the corner that the curve leaves free.
+    inset = axes.inset_axes((0.60, 0.12 if turn > 0 else 0.44, 0.38, 0.50))
+    inset.set_facecolor(COLOURS['paper'])
     near = (middle_ns - MAGNIFIED_NS, middle_ns + MAGNIFIED_NS)
     _raw_samples(view, inset, link, reference, near)
     for _, series, look in curves:
         shown = series.between(*near).select(LINK_NAMES)
         inset.plot(view.seconds(shown.stamp_ns), np.degrees(shown.position[:, link]),
-                   **{'color': LINK_COLOURS[link], **look})
+                   **{'color': LINK_COLOURS[link], **look,
+                      'linewidth': 0.7 * look['linewidth']})
     inset.set_xlim(*view.seconds(np.array(near)))
     inset.locator_params(nbins=3)
     inset.tick_params(labelsize=7.5)
@@ -203,7 +209,7 @@ def _magnify(view: View, axes: Axes, link: int, curves: list[tuple[str, JointSer
 def _goal_line(view: View, axes: Axes, link: int, reference: JointSeries) -> None:
     # A goal of 350 deg for a link at 0 may be reached at -10: draw it where the reference goes.
     near = reference.position[-1]
-    goal = near + wrap(view.motion.goal - near)
+    goal = near + wrap_angles(view.motion.goal - near)
     axes.axhline(float(np.degrees(goal[link])), color=COLOURS['limit'], linewidth=1.0,
                  linestyle=(0, (6, 2)), label='goal', zorder=1.5)
 
@@ -217,10 +223,10 @@ def _raw_samples(view: View, axes: Axes, link: int, reference: JointSeries,
         raw = raw.between(*near)
     # Raw angles lie in (-pi, pi]: show them on the turn that the reference is on.
     nearby = np.interp(raw.stamp_ns, reference.stamp_ns, reference.position[:, link])
-    angle = nearby + wrap(raw.position[:, link] - nearby)
+    angle = nearby + wrap_angles(raw.position[:, link] - nearby)
     time, angle = style.thin_out(view.seconds(raw.stamp_ns), np.degrees(angle), 500)
     axes.plot(time, angle, linestyle='none', marker='.', markersize=3.5, alpha=0.5,
-              color=COLOURS['muted'], markeredgewidth=0, label='raw sample')
+              color=COLOURS['muted'], markeredgewidth=0, label='raw sample', zorder=2.5)
 
 
 def errors(view: View) -> Figure:

@@ -25,8 +25,9 @@ from typing import Any, NamedTuple
 import warnings
 
 from fourbar_ros.analysis.bags import BagError, Floats, JointSeries, Nanoseconds, Recording
-from fourbar_ros.analysis.motion import find_motion, Motion, pair, Paired, wrap
+from fourbar_ros.analysis.motion import find_motion, Motion, pair, Paired
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism
+from fourbar_ros.mechanism.angles import wrap_angles
 import numpy as np
 
 INDEPENDENT_LINKS = LINK_NAMES[:2]
@@ -224,7 +225,7 @@ def _final_error(recording: Recording, motion: Motion, actual: str) -> tuple[flo
         raise BagError(f'{recording.path} ends before the step does')
     begin_ns = max(motion.step_end_ns, motion.end_ns - round(FINAL_WINDOW_S * 1e9))
     last = _within(recording, motion, actual).between(begin_ns, motion.end_ns)
-    error = wrap(last.select(INDEPENDENT_LINKS).position - motion.goal[:2])
+    error = wrap_angles(last.select(INDEPENDENT_LINKS).position - motion.goal[:2])
     return (float(np.max(np.abs(np.nanmean(error, axis=0)))),)
 
 

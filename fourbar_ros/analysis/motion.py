@@ -26,6 +26,7 @@ from dataclasses import dataclass
 
 from fourbar_ros.analysis.bags import BagError, Floats, JointSeries, Nanoseconds, Recording
 from fourbar_ros.mechanism import LINK_NAMES
+from fourbar_ros.mechanism.angles import wrap_angles
 import numpy as np
 
 ESSENTIAL_TOPICS = ('setpoint', 'reference', 'estimate/link_states', 'flywheel_states')
@@ -83,13 +84,7 @@ class Paired:
     @property
     def difference(self) -> Floats:
         """Return left minus right position, in (-pi, pi] [rad]."""
-        return wrap(self.left.position - self.right.position)
-
-
-def wrap(angle: Floats) -> Floats:
-    """Return the same angles in (-pi, pi] [rad]."""
-    wrapped: Floats = np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi), dtype=np.float64)
-    return wrapped
+        return wrap_angles(self.left.position - self.right.position)
 
 
 def pair(left: JointSeries, right: JointSeries, names: tuple[str, ...]) -> Paired:
@@ -166,7 +161,7 @@ def _follow(answer: JointSeries, asked: Floats, duration_ns: int) -> tuple[Float
     step_end = int(np.searchsorted(answer.stamp_ns, answer.stamp_ns[0] + duration_ns)) + 1
     step_end = min(step_end, len(answer) - 1)
     goal = np.where(np.isfinite(asked), asked, answer.position[step_end])
-    away = np.nanmax(np.abs(wrap(answer.position - goal)), axis=1)
+    away = np.nanmax(np.abs(wrap_angles(answer.position - goal)), axis=1)
     arrived = away[step_end] <= AT_GOAL_RAD
     if not arrived and away[step_end] > away[0] - FOLLOWED_RAD:
         return None

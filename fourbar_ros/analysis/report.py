@@ -49,7 +49,8 @@ SECTIONS = (
     ('errors', 'Tracking and estimate errors',
      'Above, how far links a and b are from the reference: coloured in truth, grey as the '
      'controller sees it. Below, how wrong the estimate is, over the band of two standard '
-     'deviations that the filter itself claims: 95 % should lie inside.'),
+     'deviations that the filter itself claims: 95 % should lie '
+     'inside. Without ground truth in the bag, only what the controller sees.'),
     ('wheels', 'Flywheels',
      'Opposite wheels carry the same load in a parallelogram: dashed curves (c, d) lie on solid '
      'ones (a, b). Speeds that do not return to zero are momentum that friction has moved.'),
@@ -172,7 +173,8 @@ def _tiles(result: dict[str, Any]) -> str:
     for name, label, show in TILES:
         value = _value(result, name)
         if value is None and name in FALLBACKS:
-            value, label = _value(result, FALLBACKS[name]), f'{label} (estimated)'
+            how = FALLBACKS[name].partition('.')[2].partition('_')[0]
+            value, label = _value(result, FALLBACKS[name]), f'{label} ({how})'
         if value is not None:
             tiles.append(f'<div><b>{show(value)}</b><span>{label}</span></div>')
     return ''.join(tiles)

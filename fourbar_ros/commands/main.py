@@ -17,7 +17,7 @@
 """
 Dispatch `fourbar NAME ...`, and `ros2 run fourbar_ros NAME ...`, to the module behind the name.
 
-A command is a module with HELP, `add_arguments(parser)` and `run(args)`. A node takes ROS
+A command is a module with `add_arguments(parser)` and `run(args)`. A node takes ROS
 arguments instead, so its name and `--ros-args ...` go to `fourbar_ros.nodes.NAME.main`. Modules
 are imported when their name is used, so that no command waits for another one's libraries.
 """
@@ -29,6 +29,7 @@ from importlib import import_module
 import logging
 import os
 import sys
+from types import ModuleType
 
 from .. import __version__
 from ..errors import FourbarError
@@ -52,6 +53,9 @@ COMMANDS = {
     'simulate': 'integrate one motion, without ROS',
 }
 
+# Commands that share a module; the others have one of their own name.
+MODULES = dict.fromkeys(('arm', 'disarm', 'stop', 'reset'), 'services')
+
 USAGE_ERROR = 2
 INTERRUPTED = 130
 
@@ -68,13 +72,14 @@ def main(argv: list[str] | None = None) -> int:
     name = argv[0] if argv else ''
     try:
         if name in NODES:
+            import_module('fourbar_ros.nodes.environment').check_environment()
             code: int = import_module(f'fourbar_ros.nodes.{name}').main(argv[1:])
             return code
         args = _parser(name).parse_args(argv)
         if not args.command:
             _parser('').print_help()
             return USAGE_ERROR
-        code = import_module(f'fourbar_ros.commands.{args.command}').run(args)
+        code = _module(args.command).run(args)
         return code
     except FourbarError as error:
         print(f'fourbar {name}: {error}', file=sys.stderr)
@@ -86,6 +91,10 @@ def main(argv: list[str] | None = None) -> int:
         # The reader of our output went away (`| head`): nothing left to say, not even at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+
+
+def _module(command: str) -> ModuleType:
+    return import_module(f'fourbar_ros.commands.{MODULES.get(command, command)}')
 
 
 def _parser(name: str) -> argparse.ArgumentParser:
@@ -101,7 +110,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
             command, help=text, description=f'{text[0].upper()}{text[1:]}.',
             formatter_class=argparse.RawDescriptionHelpFormatter)
         if command not in NODES and (completing or command == name):
-            import_module(f'fourbar_ros.commands.{command}').add_arguments(subparser)
+            _module(command).add_arguments(subparser)
     if completing:
         import argcomplete
         argcomplete.autocomplete(parser)

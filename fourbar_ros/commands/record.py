@@ -45,7 +45,6 @@ def run(args: argparse.Namespace) -> int:
     """Record until SIGINT or SIGTERM; say how much."""
     directory = Path(args.output or time.strftime('rosbag2_%Y_%m_%d-%H_%M_%S'))
     check_output(directory)
-    check_domain_id(os.environ.get('ROS_DOMAIN_ID', ''))
     try:
         from fourbar_ros.nodes.recorder import record
     except ImportError as error:
@@ -71,13 +70,3 @@ def check_output(directory: Path) -> None:
         raise FourbarError(f'cannot make {directory}: {parent} is not a directory')
     if not os.access(parent, os.W_OK | os.X_OK):
         raise FourbarError(f'cannot make {directory}: {parent} is not writable')
-
-
-def check_domain_id(domain_id: str) -> None:
-    """
-    Refuse a domain that Fast DDS has no ports for.
-
-    :raises FourbarError: not a whole number from 0 to 232; the raw error would not say so.
-    """
-    if domain_id and not (domain_id.isdecimal() and int(domain_id) <= 232):
-        raise FourbarError(f'ROS_DOMAIN_ID={domain_id} is not a whole number from 0 to 232')

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import sin
+from math import pi, sin
 
 import numpy as np
 
@@ -108,6 +108,10 @@ class Controller:
         self._stamp_ns: int | None = None
         self._eq9 = 0.0
         self._work = 0.0
+        # Compile the kernels now, not while time runs.
+        square = np.array([0.0, pi / 2.0, 0.0, pi / 2.0])
+        reduced_form(mechanism, square, np.zeros(2))
+        dependent_rates(*square, mechanism.constants.lengths)
 
     def device_armed(self, armed: bool) -> None:
         """Follow the device's arming state."""

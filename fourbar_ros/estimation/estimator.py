@@ -131,9 +131,15 @@ class Estimator:
         self._settings = settings
         self._filter: LinkageFilter | None = None
         self._pending: list[tuple[int, tuple[int, ...], Array]] = []
+        self._newest_ns = [-LONGEST_GAP_NS] * 4
         self._stamp_ns: int | None = None
         self._wheel_speeds = np.zeros(4)
         self._misfits = 0
+        # Compile the kernels now, not while time runs.
+        square = np.array([0.0, pi / 2.0, 0.0, pi / 2.0])
+        linkage = LinkageFilter(mechanism, square, 1.0, 1.0, 1.0)
+        linkage.move(1e-3, np.zeros(4))
+        linkage.correct((0, 1, 2, 3), square, 1.0)
 
     def measure(self, stamp_ns: int, names: Sequence[str], angles: Sequence[float]) -> None:
         """
@@ -150,6 +156,8 @@ class Estimator:
             self.rejected[error.kind] += 1
             self.last_rejection = str(error)
             raise
+        for link in measurement[1]:
+            self._newest_ns[link] = stamp_ns
         self._pending.append(measurement)
         self._pending.sort(key=lambda item: item[0])
         del self._pending[:-LONGEST_QUEUE]
@@ -251,9 +259,12 @@ class Estimator:
                 raise MeasurementError('names', f'{name} is named twice')
             if not isfinite(angles[index]):
                 raise MeasurementError('finite', f'position of {name} is {angles[index]}')
-        if self._stamp_ns is not None and 0 <= self._stamp_ns - stamp_ns < LONGEST_GAP_NS:
-            raise MeasurementError('late', 'measured at or before the last tick')
         links = tuple(LINK_NAMES.index(name) for name in names)
+        # A sample of the last tick itself that was overtaken by it still serves the next one.
+        if self._stamp_ns is not None and 0 < self._stamp_ns - stamp_ns < LONGEST_GAP_NS:
+            raise MeasurementError('late', 'measured before the last tick')
+        if any(0 <= self._newest_ns[link] - stamp_ns < LONGEST_GAP_NS for link in links):
+            raise MeasurementError('repeated', 'stamp is not newer than that of the last sample')
         order = sorted(range(len(links)), key=lambda index: links[index])
         return (stamp_ns, tuple(links[i] for i in order),
                 wrap_angles([angles[i] for i in order]))

@@ -100,21 +100,3 @@ def declare(node, table, changed=None):
 
     node.add_on_set_parameters_callback(on_set)
     return values
-
-
-def yaml_of(tables):
-    """
-    Write the parameters file of several nodes.
-
-    :param tables: dict of tables by node name.
-    :returns: text of a file for `--params-file`, valid in any namespace.
-    """
-    lines = ['# Parameters of all nodes with their defaults, for --ros-args --params-file FILE.',
-             '# The keys hold in any namespace.']
-    for node, table in tables.items():
-        lines += ['', f'/**/{node}:', '  ros__parameters:']
-        for row in table:
-            unit = f' [{row.unit}]' if row.unit else ''
-            value = f"'{row.default}'" if isinstance(row.default, str) else row.default
-            lines.append(f'    {row.name}: {value}  # {row.meaning}{unit}')
-    return '\n'.join(lines) + '\n'

@@ -21,18 +21,16 @@ service each publisher offered, so that ``ros2 bag play`` sends latched topics l
 
 from functools import partial
 import importlib
-import signal
 import time
 
 from fourbar_ros.errors import FourbarError
-import rclpy
+from fourbar_ros.nodes.runtime import Runtime, SPIN_TIMEOUT
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidTopicNameException
-from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
+from rclpy.validate_topic_name import validate_topic_name
 import rosbags.interfaces as bag
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.typesys import get_typestore, Stores, TypesysError
@@ -55,6 +53,8 @@ class Recorder(Node):
 
     def __init__(self, writer, topics, exclude_internal):
         super().__init__('recorder', enable_rosout=False, start_parameter_services=False)
+        for topic in topics:
+            validate_topic_name(topic)
         self.wanted = {self.resolve_topic_name(topic) for topic in topics}
         self.excluded = INTERNAL_TOPICS if exclude_internal else ()
         self.writer = writer
@@ -150,31 +150,29 @@ def record(directory, topics=(), *, exclude_internal=False, ros_args=(), live=Fa
     :returns: number of messages by topic.
     :raises RecorderError: it cannot start, or cannot write.
     """
-    stopped = []
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: stopped.append(True))
+    runtime = Runtime(['--ros-args', *ros_args])
     try:
         writer = Writer(directory, version=9, storage_plugin=StoragePlugin.MCAP)
-        rclpy.init(args=['--ros-args', *ros_args], signal_handler_options=SignalHandlerOptions.NO)
         node = Recorder(writer, topics, exclude_internal)
+        runtime.executor.add_node(node)
         with writer, tqdm(unit=' messages', disable=not live, leave=False) as progress:
             tqdm.write(f'recording to {directory}')
-            _spin(node, stopped, progress)
-    except (InvalidTopicNameException, WriterError, OSError) as error:
-        raise RecorderError(' '.join(str(error).split())) from error
+            _spin(runtime, node, progress)
+    except InvalidTopicNameException as error:
+        raise RecorderError(' '.join(str(error).rstrip(' ^\n').split())) from error
+    except (WriterError, OSError) as error:
+        raise RecorderError(f'cannot write {directory}: {error}') from error
     finally:
-        rclpy.try_shutdown()
+        runtime.shut_down()
     if node.failure:
         raise RecorderError(node.failure)
     return node.counts
 
 
-def _spin(node, stopped, progress):
-    executor = EventsExecutor()
-    executor.add_node(node)
-    while not stopped and not node.failure:
-        executor.spin_once(timeout_sec=0.2)
+def _spin(runtime, node, progress):
+    while not runtime.stopping and not node.failure:
+        runtime.executor.spin_once(timeout_sec=SPIN_TIMEOUT)
         progress.update(sum(node.counts.values()) - progress.n)
     end = time.monotonic() + DRAIN_S
     while time.monotonic() < end:
-        executor.spin_once(timeout_sec=0.05)
+        runtime.executor.spin_once(timeout_sec=0.05)

@@ -15,33 +15,20 @@
 """How every node starts, runs and ends."""
 
 import argparse
-from importlib.metadata import PackageNotFoundError, version
-import os
 import signal
-import sys
 
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.nodes.environment import RosError
 import rclpy
 from rclpy.exceptions import (
     InvalidNamespaceException, InvalidNodeNameException, InvalidTopicNameException,
     ParameterException,
 )
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-try:
-    from rclpy.experimental.events_executor import EventsExecutor
-except ImportError:
-    EventsExecutor = None
-
-OLDEST_RCLPY = (7, 1, 4)
-
 # The executor of these wheels hangs in any wait without a time limit [s].
 SPIN_TIMEOUT = 0.2
-
-
-class RosError(FourbarError):
-    """ROS is missing, foreign, or refused what it was asked."""
 
 
 class Runtime:
@@ -52,7 +39,6 @@ class Runtime:
     """
 
     def __init__(self, ros_args=()):
-        check_environment()
         self.stopping = False
         self.failure = None
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -120,36 +106,6 @@ def run_node(make_node, name, description, argv):
             node.destroy_node()
         runtime.shut_down()
     return 0
-
-
-def check_environment():
-    """
-    Refuse what would fail later with a message that nobody understands.
-
-    :raises RosError: foreign rclpy, unusable middleware, bad domain id.
-    """
-    try:
-        found = version('rclpy')
-    except PackageNotFoundError:
-        found = '0'
-    numbers = tuple(int(part) for part in found.split('.')[:3] if part.isdigit())
-    if EventsExecutor is None or numbers < OLDEST_RCLPY:
-        where = os.path.dirname(rclpy.__file__)
-        raise RosError(f'rclpy {found} in {where} is not that of ROS 2 Jazzy '
-                       f'(7.1.4 or later): is another ROS sourced?')
-    domain = os.environ.get('ROS_DOMAIN_ID', '')
-    if domain and not (domain.isdigit() and int(domain) <= 232):
-        raise RosError(f'ROS_DOMAIN_ID must be a whole number from 0 to 232, not {domain!r}')
-    try:
-        rclpy.get_rmw_implementation_identifier()
-    except Exception:  # noqa: B902
-        wanted = os.environ.get('RMW_IMPLEMENTATION', 'the default')
-        raise RosError(f'RMW_IMPLEMENTATION {wanted} cannot be loaded here') from None
-
-
-def steady_sleepless_print(message):
-    """Print a line at once, whatever stdout is connected to."""
-    print(message, file=sys.stdout, flush=True)
 
 
 def _first_line(error):

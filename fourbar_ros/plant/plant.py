@@ -102,6 +102,9 @@ class Plant:
         self._state = _initial_state(mechanism, initial)
         self._efforts = np.zeros(4)
         self._scratch = np.empty((6, STATE_SIZE))
+        # Compile the kernels now, not while time runs.
+        self.advance(1, np.zeros(4))
+        self._state = _initial_state(mechanism, initial)
 
     def steps_in(self, duration_s: float) -> int:
         """

@@ -1,0 +1,73 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Turn a rosbag2 directory into one HTML page and one JSON file of metrics."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from pathlib import Path
+import sys
+from typing import Any
+
+from fourbar_ros.errors import FourbarError
+
+HELP = 'turn a bag into an HTML report and metrics'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument('bag', metavar='BAG', help='rosbag2 directory (MCAP or SQLite)')
+    parser.add_argument(
+        '-o', '--output', metavar='HTML',
+        help='page to write (default: BAG.report.html, beside the directory)')
+    parser.add_argument(
+        '--metrics', metavar='JSON',
+        help='metrics to write, units in their names (default: BAG.metrics.json)')
+    parser.add_argument(
+        '--mechanism', metavar='NAME_OR_PATH',
+        help='mechanism preset or file (default: what the device said in the bag)')
+    parser.add_argument(
+        '--namespace', metavar='NS',
+        help='namespace of the suite in the bag, where it holds more than one')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read the bag, write both files, say where they are."""
+    try:
+        from fourbar_ros.analysis.report import write_report
+        import matplotlib  # noqa: F401
+        import rosbags  # noqa: F401
+        from tqdm import tqdm
+    except ImportError as error:
+        raise FourbarError(
+            f'{error.name} is missing: pip install fourbar_ros[analysis]') from error
+
+    def progress(items: Iterable[Any], total: int) -> Iterable[Any]:
+        # disable=None: only where stderr is a terminal.
+        bar: Iterable[Any] = tqdm(items, total=total, disable=None, leave=False, file=sys.stderr)
+        return bar
+
+    bag = Path(args.bag)
+    beside = bag.absolute()
+    html = Path(args.output or beside.with_name(f'{beside.name}.report.html'))
+    metrics_json = Path(args.metrics or beside.with_name(f'{beside.name}.metrics.json'))
+    result = write_report(bag, html, metrics_json, args.mechanism, namespace=args.namespace,
+                          progress=progress)
+    for reason in dict.fromkeys(result['missing'].values()):
+        names = [name for name, why in result['missing'].items() if why == reason]
+        print(f'without {", ".join(names)}: {reason}', file=sys.stderr)
+    print(f'{html}\n{metrics_json}')
+    return 0

@@ -1,0 +1,39 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""`fourbar arm`, `disarm`, `stop`, `reset`: call one service of the device."""
+
+from __future__ import annotations
+
+import argparse
+
+from .ros import add_ros_arguments, operator, report_verdict
+
+CALLS = {
+    'arm': lambda testbed: testbed.arm(True),
+    'disarm': lambda testbed: testbed.arm(False),
+    'stop': lambda testbed: testbed.trigger('emergency_stop'),
+    'reset': lambda testbed: testbed.trigger('reset_emergency_stop'),
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add_ros_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Call the service and tell the answer; exit code 1 if it is a refusal."""
+    with operator(args) as testbed:
+        return report_verdict(*CALLS[args.command](testbed))

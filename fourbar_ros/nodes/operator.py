@@ -1,0 +1,141 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What an operator does over ROS: call services, send setpoints, read states."""
+
+import time
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from fourbar_ros.nodes.environment import RosError
+from fourbar_ros.nodes.messages import LATCHED, RELIABLE, SENSOR, stamp_of
+from fourbar_ros.nodes.runtime import Runtime
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+
+# How long a running node may need to be found, or to answer [s].
+PATIENCE = 5.0
+
+
+class Operator:
+    """
+    A short-lived node; use as a context manager.
+
+    :param ros_args: ROS arguments including `--ros-args`, for namespace and remapping.
+    """
+
+    def __init__(self, ros_args=()):
+        self.runtime = Runtime(ros_args)
+        self.node = Node('operator', enable_rosout=False, start_parameter_services=False)
+        self.runtime.executor.add_node(self.node)
+        self.statuses = {}
+        self.stamp_ns = None
+
+    def __enter__(self):
+        """Return the operator."""
+        return self
+
+    def __exit__(self, *_):
+        """End ROS in this process."""
+        self.node.destroy_node()
+        self.runtime.shut_down()
+
+    def wait(self, condition, seconds=PATIENCE, missing=None):
+        """
+        Run callbacks until a condition holds.
+
+        :param missing: what to say if it does not hold in time; None to return False instead.
+        :raises RosError: with `missing`.
+        :raises KeyboardInterrupt: a signal came.
+        """
+        end = time.monotonic() + seconds
+        while not condition():
+            if self.runtime.stopping:
+                raise KeyboardInterrupt
+            if self.runtime.failure is not None:
+                raise self.runtime.failure
+            remaining = end - time.monotonic()
+            if remaining <= 0.0:
+                if missing is None:
+                    return False
+                raise RosError(f'{missing} within {seconds:g} s')
+            self.runtime.executor.spin_once(timeout_sec=min(0.05, remaining))
+        return True
+
+    def follow(self, *topics):
+        """Keep the newest status of `device_status` or `controller_status` in `statuses`."""
+        def keep(topic):
+            def on_status(message):
+                self.statuses[topic] = {item.key: item.value for item in message.values}
+            return on_status
+        for topic in topics:
+            self.node.create_subscription(
+                DiagnosticStatus, topic, self.runtime.guard(keep(topic)), LATCHED)
+
+    def follow_ticks(self):
+        """Keep the stamp of the newest tick in `stamp_ns`."""
+        def on_tick(message):
+            self.stamp_ns = stamp_of(message)
+        self.node.create_subscription(
+            JointState, 'flywheel_states', self.runtime.guard(on_tick), SENSOR)
+
+    def call(self, kind, service, request, patience=PATIENCE):
+        """
+        Call one of the device's services.
+
+        :param kind: its type.
+        :returns: success and message of the response.
+        :raises RosError: nobody offers it, or nobody answers.
+        """
+        client = self.node.create_client(kind, service)
+        name = self.node.resolve_service_name(service)
+        self.wait(client.service_is_ready, patience,
+                  f'no device found: service {name} did not appear')
+        future = client.call_async(request)
+        self.wait(future.done, patience, f'no answer from service {name}')
+        response = future.result()
+        self.node.destroy_client(client)
+        return response.success, response.message
+
+    def arm(self, wanted):
+        """Ask the device to arm or disarm: success and message."""
+        return self.call(SetBool, 'arm', SetBool.Request(data=wanted))
+
+    def trigger(self, service):
+        """Call a service without arguments: success and message."""
+        return self.call(Trigger, service, Trigger.Request())
+
+    def setpoint(self, names, positions):
+        """
+        Send a setpoint and wait for the controller's verdict.
+
+        :returns: whether it was accepted, and why not.
+        :raises RosError: no device, no controller, or no verdict.
+        """
+        self.follow('controller_status')
+        self.follow_ticks()
+        publisher = self.node.create_publisher(JointState, 'setpoint', RELIABLE)
+        self.wait(lambda: self.stamp_ns is not None,
+                  missing='no device found: no flywheel_states came')
+        self.wait(lambda: publisher.get_subscription_count() > 0 and self.statuses,
+                  missing='no controller found: nobody takes setpoint')
+        stamp_ns = self.stamp_ns
+        message = JointState(name=list(names), position=list(positions))
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+        refused = self.statuses['controller_status']['refused']
+        publisher.publish(message)
+        self.wait(lambda: self.statuses['controller_status']['judged_stamp_ns'] == str(stamp_ns),
+                  missing='no verdict from the controller')
+        status = self.statuses['controller_status']
+        return status['refused'] == refused, status['last_refusal']

@@ -1,0 +1,75 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The parameter tables of all nodes, and the files made from them.
+
+`python -m fourbar_ros.nodes.tables` writes config/nodes.yaml to standard output, with
+`--markdown` the tables of docs/topics.md.
+"""
+
+import sys
+
+from fourbar_ros.nodes import controller, estimator, plant
+
+TABLES = {
+    'plant': plant.PARAMETERS,
+    'estimator': estimator.PARAMETERS,
+    'controller': controller.PARAMETERS,
+}
+
+
+def yaml_text():
+    """Write a parameters file that holds in any namespace."""
+    lines = ['# Parameters of all nodes with their defaults, for --ros-args --params-file FILE.',
+             '# The keys hold in any namespace.']
+    for node, table in TABLES.items():
+        lines += ['', f'/**/{node}:', '  ros__parameters:']
+        for row in table:
+            unit = f' [{row.unit}]' if row.unit else ''
+            lines.append(f'    {row.name}: {_scalar(row.default)}  # {row.meaning}{unit}')
+    return '\n'.join(lines) + '\n'
+
+
+def markdown_text():
+    """Write one table per node."""
+    lines = []
+    for node, table in TABLES.items():
+        lines += [f'#### `{node}`', '',
+                  '| parameter | default | unit | allowed | at run time | meaning |',
+                  '|---|---|---|---|---|---|']
+        for row in table:
+            allowed = ''
+            if row.choices is not None:
+                allowed = ', '.join(f'`{choice}`' for choice in row.choices)
+            elif row.limits is not None:
+                allowed = f'{row.limits[0]:g} to {row.limits[1]:g}'
+            lines.append(f'| `{row.name}` | `{row.default}` | {row.unit} | {allowed} | '
+                         f'{"yes" if row.live else "no"} | {row.meaning} |')
+        lines.append('')
+    return '\n'.join(lines)
+
+
+def _scalar(value):
+    if isinstance(value, str):
+        return f"'{value}'"
+    # YAML 1.1 takes 1e-07 for a string: a float needs its point.
+    text = repr(value)
+    if 'e' in text and '.' not in text:
+        text = text.replace('e', '.0e')
+    return text
+
+
+if __name__ == '__main__':
+    sys.stdout.write(markdown_text() if '--markdown' in sys.argv else yaml_text())

@@ -1,0 +1,251 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The loop closes on both branches, from any two links, and continues across +-pi."""
+
+from itertools import combinations
+from math import acos, inf, isclose, pi
+
+from fourbar_ros.mechanism import (
+    assemble, branch_of, closure_error, ClosureError, Mechanism, nearest_assembly,
+)
+from fourbar_ros.mechanism.closure import BRANCHES, solve_pair, wrap
+from hypothesis import assume, given, settings, strategies as st
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+PAIRS = tuple(combinations(range(4), 2))
+
+# Angles up to 10 rad and lengths up to 0.5 m carry rounding of 2e-15 rad and 1e-16 m, an arc
+# cosine at most 1 / sin(FOLD) of its argument's; ratios of lengths reach 10. Hence 1e-12.
+EXACT = 1e-12
+FOLD = 0.05
+
+repeatable = settings(derandomize=True, deadline=None, max_examples=60)
+
+
+def linkage(lengths: tuple[float, ...]) -> Mechanism:
+    """Make a linkage of which only the lengths matter."""
+    middle = [[0.5 * length, 0.0] for length in lengths]
+    return Mechanism(lengths, [0.02] * 4, [2e-5] * 4, middle, [3e-7] * 4)
+
+
+@st.composite
+def assembled(draw: st.DrawFn) -> tuple[Mechanism, Array, str]:
+    """Draw a linkage, its angles away from any fold of a, b or of c, d, and their branch."""
+    lengths = draw(st.tuples(*[st.floats(0.05, 0.5)] * 4))
+    low = max(abs(lengths[0] - lengths[1]), abs(lengths[2] - lengths[3]))
+    high = min(lengths[0] + lengths[1], lengths[2] + lengths[3])
+    assume(high - low > 0.05 * high)
+    diagonal = low + draw(st.floats(0.05, 0.95)) * (high - low)
+    cosine = (lengths[0]**2 + lengths[1]**2 - diagonal**2) / (2 * lengths[0] * lengths[1])
+    theta = acos(cosine) * draw(st.sampled_from([-1.0, 1.0]))
+    phi_a = draw(st.floats(-10.0, 10.0))
+    branch = draw(st.sampled_from(BRANCHES))
+    mechanism = linkage(lengths)
+    angles = assemble(mechanism, phi_a, phi_a + theta, branch)
+    assume(abs(np.sin(angles[3] - angles[2])) > FOLD)
+    return mechanism, angles, branch
+
+
+def distance(first: Array, second: Array) -> float:
+    """Measure how far apart two sets of angles are, whole turns not counted [rad]."""
+    return float(np.abs((first - second + pi) % (2.0 * pi) - pi).max())
+
+
+@given(case=assembled())
+@repeatable
+def test_assembly_closes(case: tuple[Mechanism, Array, str]) -> None:
+    mechanism, angles, _ = case
+    assert closure_error(mechanism, angles) < EXACT * mechanism.link_lengths.sum()
+
+
+@given(case=assembled())
+@repeatable
+def test_assembly_is_on_the_branch_asked_for(case: tuple[Mechanism, Array, str]) -> None:
+    _, angles, branch = case
+    assert branch_of(angles) == branch
+
+
+@given(case=assembled())
+@repeatable
+def test_two_branches_differ(case: tuple[Mechanism, Array, str]) -> None:
+    """Joint 3 changes sides, so c and d each turn by twice an angle of their triangle."""
+    mechanism, angles, branch = case
+    other = assemble(mechanism, *angles[:2], BRANCHES[1 - BRANCHES.index(branch)])
+    assert distance(angles, other) > FOLD
+
+
+@given(case=assembled())
+@repeatable
+def test_angles_given_are_kept(case: tuple[Mechanism, Array, str]) -> None:
+    mechanism, angles, branch = case
+    np.testing.assert_array_equal(assemble(mechanism, *angles[:2], branch)[:2], angles[:2])
+
+
+@pytest.mark.parametrize('pair', PAIRS)
+@given(case=assembled())
+@repeatable
+def test_any_pair_of_links_gives_the_others(
+    pair: tuple[int, int], case: tuple[Mechanism, Array, str],
+) -> None:
+    mechanism, angles, _ = case
+    assume(away_from_fold(mechanism, angles, pair))
+    solutions = solve_pair(mechanism, pair, tuple(angles[list(pair)]))
+    assert min(distance(solution, angles) for solution in solutions) < 1e2 * EXACT
+
+
+@pytest.mark.parametrize('pair', PAIRS)
+@given(case=assembled())
+@repeatable
+def test_both_solutions_of_a_pair_close(
+    pair: tuple[int, int], case: tuple[Mechanism, Array, str],
+) -> None:
+    mechanism, angles, _ = case
+    assume(away_from_fold(mechanism, angles, pair))
+    solutions = solve_pair(mechanism, pair, tuple(angles[list(pair)]))
+    assert len(solutions) == 2
+    for solution in solutions:
+        assert closure_error(mechanism, solution) < EXACT * mechanism.link_lengths.sum()
+
+
+def away_from_fold(mechanism: Mechanism, angles: Array, pair: tuple[int, int]) -> bool:
+    """Tell whether the two other links are far enough from a line to be well determined."""
+    k, m = (index for index in range(4) if index not in pair)
+    lengths = mechanism.link_lengths
+    sign = 1.0 if (k in (0, 3)) == (m in (0, 3)) else -1.0
+    gap = lengths[k] * np.exp(1j * angles[k]) + sign * lengths[m] * np.exp(1j * angles[m])
+    return bool(abs(np.sin(angles[k] - angles[m])) > FOLD and abs(gap) > FOLD * lengths.max())
+
+
+@pytest.mark.parametrize('pair', PAIRS)
+@given(case=assembled(), turns=st.floats(-20.0, 20.0))
+@repeatable
+def test_nearest_assembly_finds_the_linkage_again(
+    pair: tuple[int, int], case: tuple[Mechanism, Array, str], turns: float,
+) -> None:
+    """From angles that are off by less than the way to the other branch, any number of turns."""
+    mechanism, angles, _ = case
+    angles = angles + turns
+    assume(away_from_fold(mechanism, angles, pair))
+    near = angles + 0.2 * FOLD * np.array([1.0, -1.0, -1.0, 1.0])
+    found = nearest_assembly(mechanism, pair, tuple(angles[list(pair)]), near)
+    np.testing.assert_allclose(found, angles, rtol=0.0, atol=1e2 * EXACT)
+
+
+@pytest.mark.parametrize('pair', PAIRS)
+@pytest.mark.parametrize('branch', BRANCHES)
+def test_nearest_assembly_is_continuous_over_whole_turns(
+    pair: tuple[int, int], branch: str,
+) -> None:
+    """A rigid turn moves every angle by the same amount, past +-pi and on."""
+    mechanism = linkage((0.12, 0.1, 0.11, 0.09))
+    start = assemble(mechanism, 0.3, 1.4, branch)
+    angles, turn = start, 0.0
+    while turn < 4.5 * pi:
+        turn += 0.05
+        known = start[list(pair)] + turn
+        angles = nearest_assembly(mechanism, pair, tuple(known), angles)
+        np.testing.assert_allclose(angles, start + turn, rtol=0.0, atol=1e2 * EXACT)
+
+
+@pytest.mark.parametrize('theta', [0.01, 0.5, pi / 2, 3.0, -0.7, -3.1])
+def test_open_parallelogram_has_parallel_sides(theta: float) -> None:
+    angles = assemble(linkage((0.15, 0.08, 0.15, 0.08)), 0.4, 0.4 + theta, 'open')
+    assert distance(angles[2:], angles[:2]) < 1e-12
+
+
+def test_crossed_parallelogram_has_not() -> None:
+    angles = assemble(linkage((0.15, 0.08, 0.15, 0.08)), 0.4, 1.4, 'crossed')
+    assert distance(angles[2:], angles[:2]) > 0.1
+
+
+@pytest.mark.parametrize('branch', BRANCHES)
+@pytest.mark.parametrize('theta', [0.0, pi])
+def test_branches_meet_where_the_parallelogram_is_folded(theta: float, branch: str) -> None:
+    """There c and d lie on a line: both names give the one assembly."""
+    angles = assemble(linkage((0.15, 0.08, 0.15, 0.08)), 0.4, 0.4 + theta, branch)
+    # An arc cosine at its end gives the root of its argument's rounding.
+    assert distance(angles[2:], angles[:2]) < 1e-7
+
+
+def test_unknown_branch_is_refused() -> None:
+    with pytest.raises(ClosureError, match="unknown branch 'folded' .known are open, crossed."):
+        assemble(linkage((0.1,) * 4), 0.0, 1.0, 'folded')
+
+
+def test_configuration_out_of_reach_is_refused() -> None:
+    with pytest.raises(ClosureError) as refusal:
+        assemble(linkage((0.3, 0.3, 0.1, 0.1)), 0.0, pi)
+    assert str(refusal.value) == (
+        'the loop cannot close at link_a = 0.0000 rad and link_b = 3.1416 rad: '
+        'link_c and link_d reach 0 to 0.2 m, needed are 0.6 m')
+
+
+@pytest.mark.parametrize(('pair', 'names'), [
+    ((0, 2), 'link_a = 0.5000 rad and link_c = 0.5000 rad'),
+    ((1, 3), 'link_b = 0.5000 rad and link_d = 0.5000 rad')])
+def test_opposite_links_of_a_parallelogram_do_not_determine_it(
+    pair: tuple[int, int], names: str,
+) -> None:
+    with pytest.raises(ClosureError, match=f'{names} do not determine the configuration'):
+        solve_pair(linkage((0.15, 0.08, 0.15, 0.08)), pair, (0.5, 0.5))
+
+
+def test_folded_rhombus_is_not_determined_by_a_and_b() -> None:
+    with pytest.raises(ClosureError, match='do not determine the configuration'):
+        assemble(linkage((0.1,) * 4), 0.5, 0.5)
+
+
+@given(phi_a=st.floats(-10.0, 10.0), theta=st.floats(0.1, 3.0))
+@repeatable
+def test_closure_error_is_the_gap_that_a_wrong_angle_leaves(phi_a: float, theta: float) -> None:
+    """Turning link c alone by x moves its end along a chord, 2 l sin(x / 2)."""
+    mechanism = linkage((0.1,) * 4)
+    angles = assemble(mechanism, phi_a, phi_a + theta)
+    angles[2] += 0.2
+    assert isclose(closure_error(mechanism, angles), 0.2 * np.sin(0.1), abs_tol=EXACT)
+
+
+@given(angle=st.floats(-1e3, 1e3))
+@repeatable
+def test_wrapped_angle_lies_in_one_turn(angle: float) -> None:
+    assert -pi < wrap(angle) <= pi
+
+
+@pytest.mark.parametrize('turns', range(-9, 10))
+@pytest.mark.parametrize('towards', [-inf, 0.0, inf])
+def test_angle_beside_half_a_turn_is_wrapped_into_it(turns: int, towards: float) -> None:
+    angle = (2 * turns + 1) * pi
+    if towards:
+        angle = float(np.nextafter(angle, towards))
+    assert -pi < wrap(angle) <= pi
+
+
+@given(angle=st.floats(-1e3, 1e3))
+@repeatable
+def test_wrapping_takes_off_whole_turns(angle: float) -> None:
+    turns = (angle - wrap(angle)) / (2.0 * pi)
+    assert isclose(turns, round(turns), abs_tol=1e-12)
+
+
+@pytest.mark.parametrize('branch', BRANCHES)
+@pytest.mark.parametrize('phi_a', [-1.0, 0.0, 1.0])
+@pytest.mark.parametrize('phi_b', [-pi, 0.5, 2.0, pi])
+def test_angles_worked_out_lie_in_one_turn(phi_a: float, phi_b: float, branch: str) -> None:
+    angles = assemble(linkage((0.1,) * 4), phi_a, phi_b, branch)
+    assert -pi < angles[2] <= pi
+    assert -pi < angles[3] <= pi

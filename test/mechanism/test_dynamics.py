@@ -1,0 +1,425 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The reduced equations against facts derived by hand and against an independent derivation."""
+
+from collections.abc import Callable
+from typing import Any
+
+from fourbar_ros.mechanism import (
+    angular_momentum, kinetic_energy, load_mechanism, Mechanism, reduced_form,
+)
+from fourbar_ros.mechanism.dynamics import (
+    _constrained_accelerations, _reduced_accelerations, ChangePointError, link_accelerations,
+    mass_matrix,
+)
+from fourbar_ros.mechanism.motion import (
+    LINK_ANGLES, LINK_RATES, state_derivative, WHEEL_ANGLES, WHEEL_SPEEDS,
+)
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+Draw = Callable[[np.random.Generator], Mechanism]
+
+SEEDS = range(40)
+ANGLES = (0.05, 0.3, 1.0, np.pi / 2, 2.0, 3.0, -0.8)
+
+
+def parallelogram(length_a: float, length_b: float, offsets: Any = (0.0,) * 4) -> Mechanism:
+    """Make the paper's links in other lengths: mass centre in the middle, or offset from it."""
+    lengths = np.array([length_a, length_b, length_a, length_b])
+    return Mechanism(
+        lengths, [0.02] * 4, [2.2e-5] * 4, np.column_stack([0.5 * lengths, offsets]),
+        [3.4e-7] * 4)
+
+
+def condition(linkage: Mechanism, theta: float) -> float:
+    """Return the condition number of A where a and c, b and d are parallel."""
+    angles = [0.0, theta, 0.0, theta]
+    return float(np.linalg.cond(reduced_form(linkage, angles, [0.0, 0.0]).mass_matrix))
+
+
+def accelerations(
+    solve: Callable[..., None], linkage: Mechanism, state: Array, torques: Array,
+) -> Array:
+    """Run one of the compiled solvers on motor torques."""
+    out = np.empty(4)
+    solve(state[LINK_ANGLES], state[LINK_RATES], -torques, linkage.constants, out)
+    return out
+
+
+# --- Facts ------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('theta', ANGLES)
+def test_mass_matrix_of_the_paper_is_the_same_in_every_configuration(theta: float) -> None:
+    """Identical uniform links: A = (2 I + m l^2 / 2) times the unit matrix."""
+    form = reduced_form(load_mechanism('paper'), [0.0, theta, 0.0, theta], [0.3, -0.2])
+    np.testing.assert_allclose(form.mass_matrix, 1.44e-4 * np.eye(2), rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize(('ratio', 'expected'), [
+    (0.25, 2.8657), (0.5, 2.0870), (1.0, 1.0000), (2.0, 3.0833), (4.0, 11.4167)])
+@pytest.mark.parametrize('theta', ANGLES)
+def test_conditioning_against_the_ratio_of_lengths(
+    theta: float, ratio: float, expected: float,
+) -> None:
+    """As in paper fig. 6a, and whatever the configuration."""
+    assert condition(parallelogram(0.1 * ratio, 0.1), theta) == pytest.approx(expected, abs=5e-5)
+
+
+@pytest.mark.parametrize(('theta', 'offset', 'expected'), [
+    (np.pi / 2, 0.02, 1.0), (np.pi / 2, 0.04, 1.0), (0.3, 0.02, 1.1059), (0.3, 0.04, 1.4204)])
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_conditioning_against_the_same_offset_in_every_body_frame(
+    theta: float, offset: float, expected: float, sign: float,
+) -> None:
+    """
+    Every com_positions has y = offset, one side of each link's own x axis.
+
+    Seen from the loop that is towards the inside for a and d, away from it for b and c.
+    """
+    linkage = parallelogram(0.1, 0.1, [sign * offset] * 4)
+    assert condition(linkage, theta) == pytest.approx(expected, abs=5e-5)
+
+
+@pytest.mark.parametrize(('theta', 'offset', 'expected'), [
+    (np.pi / 2, 0.02, 3.0), (np.pi / 2, 0.04, 7.6667), (0.3, 0.02, 1.3468), (0.3, 0.04, 1.5884)])
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_conditioning_against_the_offset_towards_the_inside(
+    theta: float, offset: float, expected: float, sign: float,
+) -> None:
+    """With y = +, -, -, + (a, b, c, d) all four lie inside the loop for 0 < theta < pi."""
+    linkage = parallelogram(0.1, 0.1, sign * offset * np.array([1.0, -1.0, -1.0, 1.0]))
+    assert condition(linkage, theta) == pytest.approx(expected, abs=5e-5)
+
+
+@pytest.mark.parametrize('theta', ANGLES)
+@pytest.mark.parametrize('length_a', [0.05, 0.1, 0.3])
+def test_uniform_parallelogram_has_no_bias(length_a: float, theta: float) -> None:
+    """Its mass centre is that of the diagonals, so A is constant and the motion free of b."""
+    linkage = parallelogram(length_a, 0.1)
+    bias = reduced_form(linkage, [0.4, 0.4 + theta, 0.4, 0.4 + theta], [1.0, -2.0]).bias
+    # Rounding of I omega^2, magnified by the fold: Gamma and sigma divide by sin(theta).
+    scale = 4.0 * linkage.constants.cosine.max()
+    np.testing.assert_allclose(bias, 0.0, rtol=0.0, atol=1e-14 * scale / abs(np.sin(theta)))
+
+
+# --- Structure --------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_mass_matrix_of_the_links_is_symmetric_and_positive(
+    seed: int, random_linkage: Draw,
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    matrix = mass_matrix(rng.uniform(-4.0, 4.0, 4), linkage.constants)
+    np.testing.assert_allclose(matrix, matrix.T, rtol=0.0, atol=1e-14)
+    assert np.linalg.eigvalsh(matrix)[0] > linkage.link_inertias.min() * (1.0 - 1e-12)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_reduced_mass_matrix_is_symmetric_and_positive(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    state = random_state(rng, linkage)
+    matrix = reduced_form(linkage, state[LINK_ANGLES], state[LINK_RATES]).mass_matrix
+    assert matrix[0, 1] == matrix[1, 0]
+    # W^T M W with W^T W >= 1: not below the smallest inertia.
+    assert np.linalg.eigvalsh(matrix)[0] > linkage.link_inertias.min() * (1.0 - 1e-12)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_accelerations_keep_the_closure(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """The second derivative of the gap, sum of s l (E e alpha - e omega^2), vanishes."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    state = random_state(rng, linkage)
+    torques = rng.uniform(-1.0, 1.0, 4)
+    alpha = accelerations(link_accelerations, linkage, state, torques)
+    arms = np.array([-1.0, 1.0, 1.0, -1.0]) * linkage.link_lengths * np.exp(1j * state[:4])
+    gap = np.sum(arms * (1j * alpha - state[LINK_RATES]**2))
+    assert abs(gap) < 1e-13 * np.abs(arms * (1j * alpha - state[LINK_RATES]**2)).sum() / 0.3
+
+
+@pytest.mark.parametrize('angles', [[0.0] * 4, [0.5] * 4])
+def test_reduced_form_is_refused_at_a_change_point(angles: list[float]) -> None:
+    with pytest.raises(ChangePointError, match='links c and d lie on a line'):
+        reduced_form(load_mechanism('paper'), angles, [0.1, 0.2])
+
+
+def test_wheel_map_takes_link_torques_to_the_axes() -> None:
+    """Paper eq. 6, columns a, b, c, d: in a parallelogram c works as a, and d as b."""
+    form = reduced_form(load_mechanism('paper'), [0.0, 1.0, 0.0, 1.0], [0.0, 0.0])
+    np.testing.assert_allclose(
+        form.wheel_map, [[1, 0, 1, 0], [0, 1, 0, 1]], rtol=0.0, atol=1e-15)
+
+
+# --- The two ways to solve them ---------------------------------------------------------------
+
+# With units of order one, each result carries a few hundred roundings of numbers of order one;
+# the reduced form divides by the fold twice.
+@pytest.mark.parametrize('fold', [0.3, 0.05])
+@pytest.mark.parametrize('seed', SEEDS)
+def test_reduced_and_constrained_solutions_agree(
+    seed: int, fold: float, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    state = random_state(rng, linkage, fold)
+    torques = rng.uniform(-1.0, 1.0, 4)
+    reduced = accelerations(_reduced_accelerations, linkage, state, torques)
+    constrained = accelerations(_constrained_accelerations, linkage, state, torques)
+    sine = np.sin(state[3] - state[2])
+    np.testing.assert_allclose(
+        reduced, constrained, rtol=0.0, atol=1e-13 / sine**2 * np.abs(constrained).max())
+
+
+@pytest.mark.parametrize('theta', [0.0, np.pi])
+@pytest.mark.parametrize('seed', SEEDS)
+def test_accelerations_are_finite_at_a_change_point(
+    seed: int, theta: float, random_parallelogram: Draw,
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_parallelogram(rng)
+    phi_a = rng.uniform(-3.0, 3.0)
+    rates = rng.uniform(-1.0, 1.0, 2)
+    state = np.concatenate([np.tile([phi_a, phi_a + theta], 2), np.tile(rates, 2), np.zeros(8)])
+    alpha = accelerations(link_accelerations, linkage, state, np.zeros(4))
+    assert np.isfinite(alpha).all()
+
+
+# --- An independent derivation ----------------------------------------------------------------
+
+@pytest.fixture(scope='module')
+def maximal() -> Callable[[Mechanism, Array, Array], tuple[Array, float, float]]:
+    """
+    Derive the equations once more, in maximal coordinates, with Lagrange's method of SymPy.
+
+    Coordinates: mass centre (x, y) and angle of each of the four links, angle of each wheel; the
+    eight equations of the four joints are constraints with multipliers. Nothing is shared with
+    the package but the conventions: link order, link frames, which wheel turns on which link.
+    """
+    sympy = pytest.importorskip('sympy')
+    mechanics = pytest.importorskip('sympy.physics.mechanics')
+    xs, ys, phis, psis = (mechanics.dynamicsymbols(f'{name}:4') for name in ('x', 'y', 'p', 'w'))
+    lengths, masses, inertias, along, across, wheels, torques = (
+        sympy.symbols(f'{name}:4') for name in ('l', 'm', 'I', 'cx', 'cy', 'J', 'tau'))
+    time = mechanics.dynamicsymbols._t
+    coordinates = [*xs, *ys, *phis, *psis]
+
+    def place(i: int, forward: Any) -> Any:
+        """Place the point of link i that is `forward` along its x axis."""
+        c, s = sympy.cos(phis[i]), sympy.sin(phis[i])
+        return sympy.Matrix([
+            xs[i] + c * (forward - along[i]) + s * across[i],
+            ys[i] + s * (forward - along[i]) - c * across[i]])
+
+    joints = [place(0, 0) - place(1, 0), place(1, lengths[1]) - place(2, 0),
+              place(2, lengths[2]) - place(3, lengths[3]), place(3, 0) - place(0, lengths[0])]
+    constraints = [equation for joint in joints for equation in joint]
+    energy = sum(
+        masses[i] * (xs[i].diff(time)**2 + ys[i].diff(time)**2) / 2
+        + inertias[i] * phis[i].diff(time)**2 / 2 + wheels[i] * psis[i].diff(time)**2 / 2
+        for i in range(4))
+    table = mechanics.ReferenceFrame('N')
+    forces = []
+    for i in range(4):
+        link = table.orientnew(f'link{i}', 'Axis', [phis[i], table.z])
+        wheel = table.orientnew(f'wheel{i}', 'Axis', [psis[i], table.z])
+        forces += [(wheel, torques[i] * table.z), (link, -torques[i] * table.z)]
+    method = mechanics.LagrangesMethod(
+        energy, coordinates, forcelist=forces, frame=table, hol_coneqs=constraints)
+    method.form_lagranges_equations()
+    speeds = [coordinate.diff(time) for coordinate in coordinates]
+    jacobian = sympy.Matrix(constraints).jacobian(coordinates)
+    momentum = sum(
+        masses[i] * (xs[i] * ys[i].diff(time) - ys[i] * xs[i].diff(time))
+        + inertias[i] * phis[i].diff(time) + wheels[i] * psis[i].diff(time) for i in range(4))
+    arguments = [speeds, coordinates, lengths, masses, inertias, along, across, wheels, torques]
+    evaluate = sympy.lambdify(
+        arguments, [method.mass_matrix, method.forcing, method.lam_coeffs,
+                    (jacobian * sympy.Matrix(speeds)).diff(time).subs(
+                        {speed.diff(time): 0 for speed in speeds}),
+                    jacobian, sympy.Matrix(constraints), energy, momentum], cse=True)
+
+    def solve(linkage: Mechanism, state: Array, tau: Array) -> tuple[Array, float, float]:
+        """Return the 8 angular accelerations, the kinetic energy and the angular momentum."""
+        bodies = (
+            linkage.link_lengths, linkage.link_masses, linkage.link_inertias,
+            *linkage.com_positions.T, linkage.flywheel_inertias, tau)
+        # Mass centres from joint 1 on, then from that of the whole; speeds from the joints.
+        turn = np.exp(1j * state[LINK_ANGLES])
+        arm = linkage.com_positions @ [1.0, 1j] * turn
+        rod = linkage.link_lengths * turn
+        centres = arm + [0.0, 0.0, rod[1], rod[0]]
+        centres -= linkage.link_masses @ centres / linkage.link_masses.sum()
+        spin = 1j * state[LINK_RATES]
+        moving = spin * arm + [0.0, 0.0, spin[1] * rod[1], spin[0] * rod[0]]
+        moving -= linkage.link_masses @ moving / linkage.link_masses.sum()
+        wheel_angles = state[WHEEL_ANGLES] + state[LINK_ANGLES]
+        q = np.concatenate([centres.real, centres.imag, state[LINK_ANGLES], wheel_angles])
+        dq = np.concatenate(
+            [moving.real, moving.imag, state[LINK_RATES], state[WHEEL_SPEEDS]])
+        matrix, force, reaction, centripetal, jac, gap, kinetic, spin_sum = evaluate(
+            dq, q, *bodies)
+        assert np.abs(gap).max() < 1e-14
+        assert np.abs(jac @ dq).max() < 1e-13
+        # matrix[:16] also holds the columns of the multipliers in some versions of SymPy.
+        whole = np.block([[matrix[:16, :16], jac.T], [jac, np.zeros((8, 8))]])
+        right = np.concatenate([np.ravel(force)[:16], -np.ravel(centripetal)])
+        solution = np.linalg.solve(whole, right)
+        return solution[8:16], float(kinetic), float(spin_sum)
+
+    return solve
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_accelerations_agree_with_an_independent_model(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+    maximal: Callable[..., Any],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    state = random_state(rng, linkage)
+    torques = rng.uniform(-1.0, 1.0, 4)
+    expected = maximal(linkage, state, torques)[0]
+    ours = np.empty(16)
+    state_derivative(state, torques, linkage.constants, np.empty(4), ours)
+    # Rounding times the condition number of 24 equations in units of order one.
+    np.testing.assert_allclose(
+        ours[LINK_RATES], expected[:4], rtol=0.0, atol=1e-11 * np.abs(expected[:4]).max())
+    np.testing.assert_allclose(ours[WHEEL_SPEEDS], expected[4:], rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_reduced_form_agrees_with_an_independent_model(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+    maximal: Callable[..., Any],
+) -> None:
+    """A du + b = -G tau with the accelerations of the other model."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    state = random_state(rng, linkage)
+    torques = rng.uniform(-1.0, 1.0, 4)
+    acceleration = maximal(linkage, state, torques)[0][:2]
+    form = reduced_form(linkage, state[LINK_ANGLES], state[LINK_RATES])
+    inertial = form.mass_matrix @ acceleration + form.bias
+    applied = -form.wheel_map @ torques
+    scale = np.abs(form.mass_matrix).max() * np.abs(acceleration).max()
+    np.testing.assert_allclose(inertial, applied, rtol=0.0, atol=1e-11 * scale)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_energy_agrees_with_an_independent_model(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+    maximal: Callable[..., Any],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    state = random_state(rng, linkage)
+    ours = kinetic_energy(linkage, *np.split(state, 4)[:2], state[WHEEL_SPEEDS])
+    assert ours == pytest.approx(maximal(linkage, state, np.zeros(4))[1], rel=1e-13)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_momentum_agrees_with_an_independent_model(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+    maximal: Callable[..., Any],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    state = random_state(rng, linkage)
+    ours = angular_momentum(linkage, *np.split(state, 4)[:2], state[WHEEL_SPEEDS])
+    expected = maximal(linkage, state, np.zeros(4))[2]
+    assert ours == pytest.approx(expected, rel=1e-13, abs=1e-13)
+
+
+# --- Rates of what is conserved ---------------------------------------------------------------
+
+def rate_of(quantity: Callable[..., float], linkage: Mechanism, state: Array, torques: Array
+            ) -> float:
+    """Differentiate along the motion, central differences of sixth order."""
+    slope = np.empty(16)
+    state_derivative(state, torques, linkage.constants, np.empty(4), slope)
+    step = 2e-3 / max(1.0, np.abs(slope[LINK_RATES]).max())
+    rate = 0.0
+    for k, weight in ((1, 45.0), (2, -9.0), (3, 1.0)):
+        for sign in (1.0, -1.0):
+            there = state + sign * k * step * slope
+            rate += sign * weight * quantity(
+                linkage, there[LINK_ANGLES], there[LINK_RATES], there[WHEEL_SPEEDS])
+    return rate / (60.0 * step)
+
+
+# Differences over 2e-3 of values of about 10 J or kg m^2/s, each rounded to 1e-15 of it; the
+# formula's own error is about (2e-3)^6. With accelerations up to 100 rad/s^2 in the random
+# states the step shrinks as much as the rates grow.
+ROUNDING_OF_RATES = 1e-15 * 45.0 / 60.0 / 2e-3
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_energy_changes_by_the_power_of_the_motors(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """A motor feels its wheel's speed relative to the link."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    state = random_state(rng, linkage)
+    torques = rng.uniform(-1.0, 1.0, 4)
+    power = torques @ (state[WHEEL_SPEEDS] - state[LINK_RATES])
+    rate = rate_of(kinetic_energy, linkage, state, torques)
+    energy = kinetic_energy(linkage, *np.split(state, 4)[:2], state[WHEEL_SPEEDS])
+    alpha = accelerations(link_accelerations, linkage, state, torques)
+    bound = 10.0 * ROUNDING_OF_RATES * energy * max(1.0, np.abs(alpha).max())
+    assert rate == pytest.approx(power, rel=0.0, abs=bound)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_momentum_does_not_change_under_motor_torques(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    state = random_state(rng, linkage)
+    torques = rng.uniform(-1.0, 1.0, 4)
+    rate = rate_of(angular_momentum, linkage, state, torques)
+    size = (np.abs(linkage.constants.cosine).sum() * np.abs(state[LINK_RATES]).max()
+            + linkage.flywheel_inertias @ np.abs(state[WHEEL_SPEEDS]))
+    alpha = accelerations(link_accelerations, linkage, state, torques)
+    assert abs(rate) < 10.0 * ROUNDING_OF_RATES * size * max(1.0, np.abs(alpha).max())
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_opposite_torques_on_opposite_wheels_only_load_the_joints(
+    seed: int, random_parallelogram: Draw, random_state: Callable[..., Array],
+) -> None:
+    """The third special case of paper section 3, away from the change points."""
+    rng = np.random.default_rng(seed)
+    linkage = random_parallelogram(rng)
+    theta = rng.uniform(0.3, np.pi - 0.3)
+    phi_a = rng.uniform(-3.0, 3.0)
+    rates = rng.uniform(-1.0, 1.0, 2)
+    state = np.concatenate([np.tile([phi_a, phi_a + theta], 2), np.tile(rates, 2), np.zeros(8)])
+    first, second = rng.uniform(-1.0, 1.0, 2)
+    with_torques = accelerations(
+        link_accelerations, linkage, state, np.array([first, second, -first, -second]))
+    without = accelerations(link_accelerations, linkage, state, np.zeros(4))
+    # Rounding of tau / I, about 1 N m over the smallest 0.006 kg m^2 of the draw.
+    np.testing.assert_allclose(with_torques, without, rtol=0.0, atol=1e-15 / 0.006 / 0.3**2)

@@ -1,0 +1,94 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Drawn joints are as far apart as the links are long, and the mass centre is the origin."""
+
+from collections.abc import Callable
+
+from fourbar_ros.mechanism import com_positions_in_table, joint_positions, Mechanism
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+Draw = Callable[[np.random.Generator], Mechanism]
+
+SEEDS = range(20)
+# Joints as indices, (from, to) of the links a, b, c, d.
+ENDS = ((0, 3), (0, 1), (1, 2), (3, 2))
+# Rounding of a few numbers of about 1 m.
+ROUNDING = 1e-14
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_joints_are_a_link_apart(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    joints = joint_positions(linkage, random_state(rng, linkage)[:4])
+    distances = [np.linalg.norm(joints[end] - joints[start]) for start, end in ENDS]
+    np.testing.assert_allclose(distances, linkage.link_lengths, rtol=0.0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_link_points_along_its_angle(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    angles = random_state(rng, linkage)[:4]
+    joints = joint_positions(linkage, angles) @ [1.0, 1j]
+    directions = [(joints[end] - joints[start]) / length
+                  for (start, end), length in zip(ENDS, linkage.link_lengths)]
+    np.testing.assert_allclose(directions, np.exp(1j * angles), rtol=0.0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_mass_centre_of_the_whole_is_the_origin(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    centres = com_positions_in_table(linkage, random_state(rng, linkage)[:4])
+    np.testing.assert_allclose(
+        linkage.link_masses @ centres / linkage.link_masses.sum(), 0.0, rtol=0.0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_mass_centre_sits_in_its_link_where_the_parameters_say(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    angles = random_state(rng, linkage)[:4]
+    joints = joint_positions(linkage, angles) @ [1.0, 1j]
+    centres = com_positions_in_table(linkage, angles) @ [1.0, 1j]
+    near = joints[[start for start, _ in ENDS]]
+    np.testing.assert_allclose(
+        (centres - near) * np.exp(-1j * angles), linkage.com_positions @ [1.0, 1j], rtol=0.0,
+        atol=ROUNDING)
+
+
+@pytest.mark.parametrize('place', [joint_positions, com_positions_in_table])
+def test_many_poses_at_once_are_those_one_by_one(
+    place: Callable[..., Array], random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    rng = np.random.default_rng(0)
+    linkage = random_linkage(rng)
+    poses = np.array([[random_state(rng, linkage)[:4] for _ in range(3)] for _ in range(2)])
+    together = place(linkage, poses)
+    assert together.shape == (2, 3, 4, 2)
+    np.testing.assert_allclose(
+        together[1, 2], place(linkage, poses[1, 2]), rtol=0.0, atol=ROUNDING)

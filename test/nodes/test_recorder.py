@@ -1,0 +1,248 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The recorder over real DDS: what is published is in the bag, whatever happens."""
+
+import fcntl
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Point
+import pytest
+import rclpy
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import QosDurability, QosReliability
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import get_typestore, Stores
+from sensor_msgs.msg import JointState
+
+pytestmark = pytest.mark.node
+
+DOMAINS = range(60, 70)
+DEADLINE_S = 20.0
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@pytest.fixture
+def domain(monkeypatch):
+    """Take a domain that no other test run on this machine uses."""
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    for number in DOMAINS:
+        lock = Path(tempfile.gettempdir(), f'fourbar_ros_domain_{number}.lock').open('w')
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.close()
+            continue
+        monkeypatch.setenv('ROS_DOMAIN_ID', str(number))
+        yield number
+        lock.close()
+        return
+    pytest.fail('every domain is taken')
+
+
+@pytest.fixture
+def node(domain):
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    node = Node('publisher', context=context)
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def record(domain, tmp_path):
+    """Return a function that starts `fourbar record`; what is left of it ends with the test."""
+    started = []
+
+    def start(*arguments, **environment):
+        process = subprocess.Popen(
+            [sys.executable, '-m', 'fourbar_ros', 'record', *arguments], cwd=tmp_path, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, **environment})
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def wait_for(condition):
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def publish(publisher, count):
+    """Send numbered messages, as soon as the recorder listens."""
+    wait_for(lambda: publisher.get_subscription_count() == 1)
+    for number in range(count):
+        publisher.publish(JointState(name=['number'], position=[float(number)]))
+        time.sleep(0.0005)
+    # On their way through shared memory; asking for acknowledgements takes seconds.
+    time.sleep(0.2)
+
+
+def stop(process, number=signal.SIGINT):
+    """Return exit code, stdout and stderr after a signal."""
+    process.send_signal(number)
+    out, err = process.communicate(timeout=DEADLINE_S)
+    return process.returncode, out, err
+
+
+def numbers(bag, topic):
+    """Return the numbers that were recorded on a topic, in order."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Reader(bag) as reader:
+        connections = [c for c in reader.connections if c.topic == topic]
+        return [store.deserialize_cdr(data, connection.msgtype).position[0]
+                for connection, _, data in reader.messages(connections)] if connections else None
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+def test_every_message_is_in_the_bag_after_a_signal(node, record, tmp_path, number):
+    first, second = (node.create_publisher(JointState, name, 10) for name in ('one', 'two'))
+    process = record('-o', 'bag')
+    publish(first, 700)
+    publish(second, 300)
+    assert first.wait_for_all_acked(Duration(seconds=5))
+    assert second.wait_for_all_acked(Duration(seconds=5))
+
+    code, out, err = stop(process, number)
+
+    assert (code, err) == (0, '')
+    assert out.splitlines()[0] == 'recording to bag'
+    assert '1000 messages' in out.splitlines()[-1]
+    assert numbers(tmp_path / 'bag', '/one') == list(range(700))
+    assert numbers(tmp_path / 'bag', '/two') == list(range(300))
+
+
+def test_topics_that_appear_later_are_recorded(node, record, tmp_path):
+    early = node.create_publisher(JointState, 'early', 10)
+    process = record('-o', 'bag')
+    publish(early, 1)
+
+    publish(node.create_publisher(JointState, 'late', 10), 50)
+
+    assert stop(process)[0] == 0
+    assert numbers(tmp_path / 'bag', '/late') == list(range(50))
+
+
+def test_latched_message_from_before_is_recorded_as_latched(node, record, tmp_path):
+    latched = node.create_publisher(DiagnosticStatus, 'status', LATCHED)
+    latched.publish(DiagnosticStatus(message='armed'))
+    weak = node.create_publisher(
+        JointState, 'weak', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    process = record('-o', 'bag')
+    wait_for(lambda: latched.get_subscription_count() and weak.get_subscription_count())
+    time.sleep(0.5)
+
+    assert stop(process)[0] == 0
+
+    with Reader(tmp_path / 'bag') as reader:
+        status = reader.topics['/status']
+        offered = {c.topic: c.ext.offered_qos_profiles[0] for c in reader.connections}
+    assert status.msgcount == 1
+    assert offered['/status'].durability == QosDurability.TRANSIENT_LOCAL
+    assert offered['/weak'].durability == QosDurability.VOLATILE
+    assert offered['/weak'].reliability == QosReliability.BEST_EFFORT
+
+
+def test_named_topics_follow_the_namespace(node, record, tmp_path):
+    publishers = [node.create_publisher(JointState, name, 10)
+                  for name in ('/lab/wanted', '/absolute', '/wanted', '/lab/other')]
+    process = record('-o', 'bag', 'wanted', '/absolute', '--ros-args', '-r', '__ns:=/lab')
+    for publisher in publishers[:2]:
+        publish(publisher, 3)
+
+    assert stop(process)[0] == 0
+
+    with Reader(tmp_path / 'bag') as reader:
+        assert set(reader.topics) == {'/lab/wanted', '/absolute'}
+
+
+@pytest.mark.parametrize('internal', [True, False])
+def test_internal_topics_can_be_left_out(node, record, tmp_path, internal):
+    publisher = node.create_publisher(JointState, 'one', 10)
+    node.create_publisher(JointState, '_hidden', 10)
+    process = record('-o', 'bag', *([] if internal else ['--exclude-internal']))
+    publish(publisher, 1)
+
+    assert stop(process)[0] == 0
+
+    with Reader(tmp_path / 'bag') as reader:
+        assert ('/rosout' in reader.topics) == internal
+        assert '/_hidden' not in reader.topics
+
+
+def test_type_that_cannot_be_imported_is_named_once_and_the_rest_recorded(
+        node, record, tmp_path):
+    (tmp_path / 'shadow' / 'geometry_msgs').mkdir(parents=True)
+    (tmp_path / 'shadow' / 'geometry_msgs' / '__init__.py').touch()
+    node.create_publisher(Point, 'foreign', 10)
+    publisher = node.create_publisher(JointState, 'one', 10)
+    path = os.pathsep.join([str(tmp_path / 'shadow'), os.environ.get('PYTHONPATH', '')])
+    process = record('-o', 'bag', PYTHONPATH=path)
+    publish(publisher, 500)
+
+    code, out, _ = stop(process)
+
+    assert code == 0
+    assert [line for line in out.splitlines() if '/foreign' in line] == [
+        line for line in out.splitlines() if 'geometry_msgs/msg/Point' in line]
+    assert out.count('/foreign') == 1
+    assert numbers(tmp_path / 'bag', '/one') == list(range(500))
+
+
+def test_nothing_received_still_makes_a_bag(record, tmp_path):
+    process = record('-o', 'bag')
+    assert process.stdout.readline() == 'recording to bag\n'
+
+    assert stop(process)[0] == 0
+
+    with Reader(tmp_path / 'bag') as reader:
+        assert reader.message_count == 0
+
+
+@pytest.mark.parametrize(('arguments', 'environment', 'complaint'), [
+    (['-o', 'taken'], {}, 'exists'),
+    (['-o', 'file/bag'], {}, 'not a directory'),
+    (['-o', 'bag', 'no topic!'], {}, 'topic'),
+    (['-o', 'bag'], {'ROS_DOMAIN_ID': '999'}, 'ROS_DOMAIN_ID'),
+])
+def test_bad_input_is_one_line_and_leaves_nothing(record, tmp_path, arguments, environment,
+                                                  complaint):
+    (tmp_path / 'taken').mkdir()
+    (tmp_path / 'file').touch()
+
+    process = record(*arguments, **environment)
+    out, err = process.communicate(timeout=DEADLINE_S)
+
+    assert process.returncode == 2
+    assert out == ''
+    assert len(err.splitlines()) == 1
+    assert complaint in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['file', 'taken']
