@@ -22,9 +22,16 @@ from ..control import Controller, ControllerSettings
 from ..device import SimulatedTable, Testbed, TestbedSettings
 from ..estimation import Estimator, EstimatorSettings
 from ..mechanism import Mechanism
+from ..mechanism.compiled import cache_directory
 from ..plant import InitialState, Plant
 from ..plant.table import LinkSensors, Table, WheelEncoders
 from .closed_loop import ClosedLoop
+
+
+def is_cold() -> bool:
+    """Tell whether the kernels are still to be compiled, which takes some ten seconds."""
+    directory = cache_directory()
+    return directory is None or not any(directory.rglob('*linearise*.nbi'))
 
 
 def warm_up() -> None:

@@ -40,7 +40,9 @@ class Operator:
         self.node = Node('operator', enable_rosout=False, start_parameter_services=False)
         self.runtime.executor.add_node(self.node)
         self.statuses = {}
-        self.stamp_ns = None
+        self.joints = {}
+        self._followed = set()
+        self._setpoints = None
 
     def __enter__(self):
         """Return the operator."""
@@ -80,15 +82,42 @@ class Operator:
                 self.statuses[topic] = {item.key: item.value for item in message.values}
             return on_status
         for topic in topics:
-            self.node.create_subscription(
-                DiagnosticStatus, topic, self.runtime.guard(keep(topic)), LATCHED)
+            if topic not in self._followed:
+                self._followed.add(topic)
+                self.node.create_subscription(
+                    DiagnosticStatus, topic, self.runtime.guard(keep(topic)), LATCHED)
 
-    def follow_ticks(self):
-        """Keep the stamp of the newest tick in `stamp_ns`."""
-        def on_tick(message):
-            self.stamp_ns = stamp_of(message)
-        self.node.create_subscription(
-            JointState, 'flywheel_states', self.runtime.guard(on_tick), SENSOR)
+    def follow_joints(self, *topics):
+        """Keep the newest JointState of each topic in `joints`."""
+        def keep(topic):
+            def on_joints(message):
+                self.joints[topic] = message
+            return on_joints
+        for topic in topics:
+            if topic not in self._followed:
+                self._followed.add(topic)
+                self.node.create_subscription(
+                    JointState, topic, self.runtime.guard(keep(topic)), SENSOR)
+
+    def stamp_ns(self, topic='flywheel_states'):
+        """Return the newest stamp of a followed topic [ns], None before the first."""
+        return stamp_of(self.joints[topic]) if topic in self.joints else None
+
+    def positions(self, topic, names):
+        """Return the newest positions of some joints of a followed topic."""
+        message = self.joints[topic]
+        return [message.position[message.name.index(name)] for name in names]
+
+    def device_visible(self):
+        """Tell whether any device publishes its status here."""
+        return self.node.count_publishers(self.node.resolve_topic_name('device_status')) > 0
+
+    def recorded(self, topics):
+        """Tell whether a recorder subscribes to all of these topics."""
+        return all(
+            any(info.node_name == 'recorder' for info in
+                self.node.get_subscriptions_info_by_topic(self.node.resolve_topic_name(topic)))
+            for topic in topics)
 
     def call(self, kind, service, request, patience=PATIENCE):
         """
@@ -116,6 +145,11 @@ class Operator:
         """Call a service without arguments: success and message."""
         return self.call(Trigger, service, Trigger.Request())
 
+    def offer_setpoints(self):
+        """Become a publisher of setpoints, so that others can find it before the first one."""
+        if self._setpoints is None:
+            self._setpoints = self.node.create_publisher(JointState, 'setpoint', RELIABLE)
+
     def setpoint(self, names, positions):
         """
         Send a setpoint and wait for the controller's verdict.
@@ -124,17 +158,19 @@ class Operator:
         :raises RosError: no device, no controller, or no verdict.
         """
         self.follow('controller_status')
-        self.follow_ticks()
-        publisher = self.node.create_publisher(JointState, 'setpoint', RELIABLE)
-        self.wait(lambda: self.stamp_ns is not None,
+        self.follow_joints('flywheel_states')
+        self.offer_setpoints()
+        self.wait(lambda: self.stamp_ns() is not None,
                   missing='no device found: no flywheel_states came')
-        self.wait(lambda: publisher.get_subscription_count() > 0 and self.statuses,
+        self.wait(lambda: (self.node.count_subscribers(self._setpoints.topic_name) > 0
+                           and 'controller_status' in self.statuses),
                   missing='no controller found: nobody takes setpoint')
-        stamp_ns = self.stamp_ns
+        # The newest tick is a stamp that nobody can call stale, and tells our verdict from others.
+        stamp_ns = self.stamp_ns()
         message = JointState(name=list(names), position=list(positions))
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
         refused = self.statuses['controller_status']['refused']
-        publisher.publish(message)
+        self._setpoints.publish(message)
         self.wait(lambda: self.statuses['controller_status']['judged_stamp_ns'] == str(stamp_ns),
                   missing='no verdict from the controller')
         status = self.statuses['controller_status']

@@ -1,0 +1,211 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""`fourbar demo`: plant, estimator and controller as nodes, one move, a bag, a report."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from math import degrees, pi
+import os
+from pathlib import Path
+import shutil
+from typing import Any
+
+from ..errors import FourbarError
+from .files import OutputError
+from .processes import Processes
+
+NODES = ('plant', 'estimator', 'controller')
+
+# The paper's section 4: the whole turns by a quarter, by the soft step of the controller.
+TURN = pi / 2
+LINKS = ('link_a', 'link_b')
+
+STATUSES = ('device_status', 'controller_status')
+JOINTS = (
+    'link_angles', 'flywheel_states', 'flywheel_command', 'timing', 'sim/link_states',
+    'sim/flywheel_states', 'estimate/link_states', 'estimate/sigma', 'estimate/innovation',
+    'reference', 'tracking_error', 'energy',
+)
+
+PROGRESS = '|{bar:40}| {n:4.1f} of {total:.1f} s{postfix}'
+TABLE = (
+    ('tracking, rms', 'tracking.rms_rad', degrees(1), 'deg'),
+    ('tracking, error at the end', 'tracking.final_error_rad', degrees(1), 'deg'),
+    ('estimate, rms error', 'estimate.rms_error_rad', degrees(1), 'deg'),
+    ('wheels, peak speed', 'flywheel.peak_speed_rad_s', 1.0, 'rad/s'),
+    ('wheels, peak energy (eq. 7)', 'flywheel.peak_energy_j', 1e3, 'mJ'),
+    ('loop, rate', 'loop.rate_hz', 1.0, 'Hz'),
+    ('loop, round trip, median', 'loop.round_trip_p50_ms', 1.0, 'ms'),
+    ('loop, round trip, 99th percentile', 'loop.round_trip_p99_ms', 1.0, 'ms'),
+    ('loop, lost ticks', 'loop.lost', 1.0, ''),
+)
+
+# Times [s]: to look for another plant, for everything to come up, to settle before and after.
+LOOK_AROUND = 1.0
+START_UP = 30.0
+SETTLE_BEFORE = 1.0
+SETTLE_AFTER = 1.6
+
+EPILOG = """\
+Uses the ROS_DOMAIN_ID of the environment (default 0) with discovery on this machine alone.
+Writes DIR/bag (rosbag2, MCAP), DIR/report.html, DIR/metrics.json and DIR/logs; what a former
+demo left there is replaced.
+"""
+
+
+class DemoError(FourbarError):
+    """The demo cannot run, or something in it went wrong."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.epilog = EPILOG
+    parser.add_argument('--output', metavar='DIR', type=Path, default=Path('demo_output'),
+                        help='folder for bag, report and metrics (default demo_output)')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the whole loop once."""
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    from ..configuration import share_directory
+    os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE',
+                          str(share_directory() / 'config' / 'fastdds_loopback.xml'))
+    write_report, progress_bar = _analysis()
+    from ..nodes.environment import check_environment
+    check_environment()
+    from ..nodes.operator import Operator
+
+    with Operator() as testbed:
+        _refuse_second_plant(testbed)
+        _prepare(args.output)
+        _compile()
+        with Processes(args.output / 'logs', os.environ) as processes:
+            _move(testbed, processes, args.output / 'bag', progress_bar)
+    print('Writing the report')
+    metrics = write_report(args.output / 'bag', args.output / 'report.html',
+                           args.output / 'metrics.json')
+    _print_table(metrics)
+    print(f'Report   {args.output / "report.html"}')
+    return 0
+
+
+def _analysis() -> tuple[Callable[..., dict[str, Any]], Any]:
+    try:
+        from tqdm import tqdm
+
+        from ..analysis.report import write_report
+    except ImportError as error:
+        raise DemoError(
+            f'{error.name} is missing: pip install fourbar_ros[analysis]') from None
+    return write_report, tqdm
+
+
+def _refuse_second_plant(testbed: Any) -> None:
+    """Make sure that nobody is driven by accident, neither a real table nor another demo."""
+    if testbed.wait(testbed.device_visible, LOOK_AROUND):
+        domain = os.environ.get('ROS_DOMAIN_ID', '0')
+        raise DemoError(f'a device already runs on ROS_DOMAIN_ID {domain}: stop it, or set '
+                        'another ROS_DOMAIN_ID')
+
+
+def _prepare(output: Path) -> None:
+    """Make an empty output folder, leaving alone what is not the demo's."""
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        for name in ('bag', 'logs'):
+            if (output / name).exists():
+                shutil.rmtree(output / name)
+        for name in ('report.html', 'metrics.json'):
+            (output / name).unlink(missing_ok=True)
+        (output / 'logs').mkdir()
+    except OSError as error:
+        raise OutputError(
+            f'cannot write to {error.filename or output}: {error.strerror}') from None
+
+
+def _compile() -> None:
+    """Compile once here, or three nodes would do it side by side."""
+    from ..loop.warm_up import is_cold, warm_up
+    if is_cold():
+        print('Compiling the kernels, once (about 10 s)', flush=True)
+    warm_up()
+
+
+def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> None:
+    """Start everything, arm, move, and stop everything again."""
+    domain = os.environ.get('ROS_DOMAIN_ID', '0')
+    print(f'Starting {", ".join(NODES)}. Watch them from another terminal:\n'
+          f'  ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST '
+          'ros2 topic echo /estimate/link_states', flush=True)
+    processes.start('record', ['-o', str(bag)])
+    for name in NODES:
+        processes.start(name)
+
+    def until(condition: Callable[[], bool], missing: str, seconds: float = START_UP) -> None:
+        def checked() -> bool:
+            processes.check()
+            return condition()
+        testbed.wait(checked, seconds, missing)
+
+    testbed.offer_setpoints()
+    testbed.follow(*STATUSES)
+    testbed.follow_joints(*JOINTS)
+    until(lambda: len(testbed.statuses) == len(STATUSES) and len(testbed.joints) == len(JOINTS)
+          and testbed.recorded(('setpoint', *STATUSES, *JOINTS)), 'the nodes did not find each other')
+    settled_ns = testbed.stamp_ns() + SETTLE_BEFORE * 1e9
+    until(lambda: bool(testbed.stamp_ns() >= settled_ns), 'no ticks came')
+    _demand(*testbed.arm(True))
+    until(lambda: testbed.statuses['controller_status']['mode'] == 'hold',
+          'the controller did not notice the arming')
+    goal = [angle + TURN for angle in testbed.positions('sim/link_states', LINKS)]
+    accepted, reason = testbed.setpoint(LINKS, goal)
+    _demand(accepted, f'setpoint refused: {reason}')
+
+    start_ns = testbed.stamp_ns()
+    duration = float(testbed.statuses['controller_status']['setpoint_duration_s']) + SETTLE_AFTER
+    print(f'Turning by {degrees(TURN):g} deg, {duration:.1f} s', flush=True)
+    # disable=None: a bar only where stderr is a terminal.
+    with progress_bar(total=duration, bar_format=PROGRESS, disable=None) as bar:
+        def arrived() -> bool:
+            device = testbed.statuses['device_status']
+            _demand(device['state'] == 'armed', f'the device is {device["state"]}: '
+                                                f'{device["reason"]}')
+            elapsed = (testbed.stamp_ns() - start_ns) * 1e-9
+            angle = degrees(testbed.positions('estimate/link_states', LINKS)[0])
+            bar.set_postfix_str(f'link_a at {angle:.1f} deg', refresh=False)
+            bar.update(min(elapsed, duration) - bar.n)
+            return bool(elapsed >= duration)
+        until(arrived, 'the motion did not end', 3.0 * duration)
+    testbed.arm(False)
+    for name in ('controller', 'estimator', 'plant', 'record'):
+        processes.stop(name)
+
+
+def _demand(success: bool, message: str) -> None:
+    if not success:
+        raise DemoError(message)
+
+
+def _print_table(metrics: dict[str, Any]) -> None:
+    """Print what a person wants to know first; everything is in metrics.json."""
+    print()
+    for text, name, factor, unit in TABLE:
+        group, _, key = name.partition('.')
+        value = metrics.get(group, {}).get(key)
+        shown = 'not recorded' if value is None else f'{value * factor:10.4g} {unit}'
+        print(f'  {text:34} {shown}'.rstrip())
+    print()

@@ -1,0 +1,106 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Child processes that never outlive their parent and are stopped in order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import ctypes
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+from types import TracebackType
+
+from ..errors import FourbarError
+
+# From <sys/prctl.h>: ask the kernel for a signal when the parent dies, however it dies.
+PR_SET_PDEATHSIG = 1
+
+# How long a process may take to end after a signal [s].
+PATIENCE = 5.0
+
+LIBC = ctypes.CDLL(None)
+
+
+class ProcessError(FourbarError):
+    """A child process that ended when it should not."""
+
+
+class Processes:
+    """
+    Commands of this package in processes of their own; use as a context manager.
+
+    They get their own process group, so that Ctrl-C reaches the parent alone and everything can
+    be stopped in order, and end with the parent even if it is killed.
+
+    :param logs: folder for what they print, one file per process.
+    :param environment: of all of them.
+    """
+
+    def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
+        self._logs = logs
+        self._environment = dict(environment)
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Processes:
+        """Return itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        """Stop whatever still runs, the first started last."""
+        for name in reversed(list(self._running)):
+            self.stop(name)
+
+    def start(self, name: str, arguments: Sequence[str] = ()) -> None:
+        """Start `fourbar NAME ARGUMENTS`."""
+        with open(self._logs / f'{name}.log', 'wb') as log:
+            self._running[name] = subprocess.Popen(
+                [sys.executable, '-m', 'fourbar_ros', name, *arguments],
+                stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
+                env=self._environment, start_new_session=True, preexec_fn=_end_with_parent)
+
+    def check(self) -> None:
+        """
+        Make sure that all still run.
+
+        :raises ProcessError: one ended, with the last line that it printed.
+        """
+        for name, process in self._running.items():
+            code = process.poll()
+            if code is not None:
+                raise ProcessError(f'{name} ended with exit code {code}: {self._last_line(name)}')
+
+    def stop(self, name: str) -> None:
+        """Ask one to end, insist if it does not, and wait until it has."""
+        process = self._running.pop(name)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            if process.poll() is None:
+                process.send_signal(number)
+                try:
+                    process.wait(PATIENCE)
+                except subprocess.TimeoutExpired:
+                    continue
+
+    def _last_line(self, name: str) -> str:
+        time.sleep(0.05)    # its last words may still be on their way
+        lines = (self._logs / f'{name}.log').read_text(errors='replace').strip().splitlines()
+        return lines[-1] if lines else 'it said nothing'
+
+
+def _end_with_parent() -> None:
+    LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
