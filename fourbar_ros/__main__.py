@@ -16,7 +16,7 @@
 
 import sys
 
-from .commands.main import main
+from fourbar_ros.commands.main import main
 
 if __name__ == '__main__':
     sys.exit(main())

@@ -25,9 +25,8 @@ from pathlib import Path
 import re
 from typing import Any
 
+from fourbar_ros.errors import FourbarError
 import yaml
-
-from .errors import FourbarError
 
 PACKAGE = 'fourbar_ros'
 _SUFFIXES = ('.yaml', '.yml')

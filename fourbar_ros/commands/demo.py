@@ -24,9 +24,9 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from ..errors import FourbarError
-from .files import OutputError
-from .processes import Processes
+from fourbar_ros.commands.files import OutputError
+from fourbar_ros.commands.processes import Processes
+from fourbar_ros.errors import FourbarError
 
 NODES = ('plant', 'estimator', 'controller')
 
@@ -81,13 +81,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the whole loop once."""
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    from ..configuration import share_directory
+    from fourbar_ros.configuration import share_directory
     os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE',
                           str(share_directory() / 'config' / 'fastdds_loopback.xml'))
     write_report, progress_bar = _analysis()
-    from ..nodes.environment import check_environment
+    from fourbar_ros.nodes.environment import check_environment
     check_environment()
-    from ..nodes.operator import Operator
+    from fourbar_ros.nodes.operator import Operator
 
     with Operator() as testbed:
         _refuse_second_plant(testbed)
@@ -105,9 +105,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _analysis() -> tuple[Callable[..., dict[str, Any]], Any]:
     try:
+        from fourbar_ros.analysis.report import write_report
         from tqdm import tqdm
-
-        from ..analysis.report import write_report
     except ImportError as error:
         raise DemoError(
             f'{error.name} is missing: pip install fourbar_ros[analysis]') from None
@@ -139,7 +138,7 @@ def _prepare(output: Path) -> None:
 
 def _compile() -> None:
     """Compile once here, or three nodes would do it side by side."""
-    from ..loop.warm_up import is_cold, warm_up
+    from fourbar_ros.loop.warm_up import is_cold, warm_up
     if is_cold():
         print('Compiling the kernels, once (about 10 s)', flush=True)
     warm_up()
@@ -165,7 +164,8 @@ def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> N
     testbed.follow(*STATUSES)
     testbed.follow_joints(*JOINTS)
     until(lambda: len(testbed.statuses) == len(STATUSES) and len(testbed.joints) == len(JOINTS)
-          and testbed.recorded(('setpoint', *STATUSES, *JOINTS)), 'the nodes did not find each other')
+          and testbed.recorded(('setpoint', *STATUSES, *JOINTS)),
+          'the nodes did not find each other')
     settled_ns = testbed.stamp_ns() + SETTLE_BEFORE * 1e9
     until(lambda: bool(testbed.stamp_ns() >= settled_ns), 'no ticks came')
     _demand(*testbed.arm(True))

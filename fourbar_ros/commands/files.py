@@ -21,9 +21,9 @@ from contextlib import contextmanager
 import os
 from pathlib import Path
 import tempfile
-from typing import TextIO
+from typing import cast, TextIO
 
-from ..errors import FourbarError
+from fourbar_ros.errors import FourbarError
 
 
 class OutputError(FourbarError):
@@ -43,7 +43,7 @@ def write_whole(path: Path) -> Iterator[TextIO]:
                 'w', encoding='utf-8', newline='\n', dir=path.parent,
                 prefix=f'.{path.name}.', delete=False) as file:
             name = file.name
-            yield file
+            yield cast(TextIO, file)
         os.chmod(name, 0o666 & ~_umask())
         os.replace(name, path)
     except BaseException as error:

@@ -31,8 +31,8 @@ import os
 import sys
 from types import ModuleType
 
-from .. import __version__
-from ..errors import FourbarError
+from fourbar_ros import __version__
+from fourbar_ros.errors import FourbarError
 
 NODES = {
     'plant': 'simulated air table with the linkage on it',

@@ -25,7 +25,7 @@ import sys
 import time
 from types import TracebackType
 
-from ..errors import FourbarError
+from fourbar_ros.errors import FourbarError
 
 # From <sys/prctl.h>: ask the kernel for a signal when the parent dies, however it dies.
 PR_SET_PDEATHSIG = 1

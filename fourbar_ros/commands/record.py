@@ -45,6 +45,8 @@ def run(args: argparse.Namespace) -> int:
     """Record until SIGINT or SIGTERM; say how much."""
     directory = Path(args.output or time.strftime('rosbag2_%Y_%m_%d-%H_%M_%S'))
     check_output(directory)
+    from fourbar_ros.nodes.environment import check_environment
+    check_environment()
     try:
         from fourbar_ros.nodes.recorder import record
     except ImportError as error:

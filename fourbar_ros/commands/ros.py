@@ -36,9 +36,9 @@ def operator(args: argparse.Namespace) -> Any:
 
     :raises RosError: there is no usable ROS.
     """
-    from ..nodes.environment import check_environment
+    from fourbar_ros.nodes.environment import check_environment
     check_environment()
-    from ..nodes.operator import Operator
+    from fourbar_ros.nodes.operator import Operator
     return Operator(['--ros-args', *args.ros_args] if args.ros_args else [])
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 
-from .ros import add_ros_arguments, operator, report_verdict
+from fourbar_ros.commands.ros import add_ros_arguments, operator, report_verdict
 
 CALLS = {
     'arm': lambda testbed: testbed.arm(True),

@@ -19,8 +19,8 @@ from __future__ import annotations
 import argparse
 from math import isfinite, radians
 
-from ..errors import FourbarError
-from .ros import add_ros_arguments, operator, report_verdict
+from fourbar_ros.commands.ros import add_ros_arguments, operator, report_verdict
+from fourbar_ros.errors import FourbarError
 
 EPILOG = """\
 Angles are orientations in frame `table`, in rad or, with the suffix `deg`, in degrees:

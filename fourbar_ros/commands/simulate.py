@@ -41,10 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate and write the table."""
+    from fourbar_ros.commands.files import write_whole
+    from fourbar_ros.mechanism.case import CaseError, load_case, simulate
     import numpy as np
-
-    from .files import write_whole
-    from ..mechanism.case import CaseError, load_case, simulate
 
     if not 0.0 < args.step < float('inf'):
         raise CaseError(f'--step must be a positive number of seconds, got {args.step:g}')

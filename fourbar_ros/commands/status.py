@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 
-from .ros import add_ros_arguments, operator, REFUSED
+from fourbar_ros.commands.ros import add_ros_arguments, operator, REFUSED
 
 SOURCES = {'device': 'device_status', 'controller': 'controller_status'}
 

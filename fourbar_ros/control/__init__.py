@@ -14,6 +14,7 @@
 
 """What we want and how the wheels share it: references, tracking law, allocation."""
 
-from .controller import Control, Controller, ControllerSettings, SetpointError
+from fourbar_ros.control.controller import Control, Controller, ControllerSettings
+from fourbar_ros.control.setpoint import SetpointError
 
 __all__ = ['Control', 'Controller', 'ControllerSettings', 'SetpointError']

@@ -16,9 +16,8 @@
 
 from __future__ import annotations
 
+from fourbar_ros.mechanism.parameters import Array
 import numpy as np
-
-from ..mechanism.parameters import Array
 
 
 def minimum_norm(wheel_map: Array, flywheel_inertias: Array, demand: Array) -> Array:

@@ -20,14 +20,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import pi, sin
 
+from fourbar_ros.control.allocation import minimum_norm
+from fourbar_ros.control.reference import SoftStep
+from fourbar_ros.control.setpoint import check_move, check_names, resolve, SetpointError
+from fourbar_ros.mechanism import Mechanism, nearest_assembly
+from fourbar_ros.mechanism.dynamics import gamma_matrix, NEAR_ALIGNMENT, reduced_form
+from fourbar_ros.mechanism.parameters import Array
 import numpy as np
-
-from ..mechanism import Mechanism, nearest_assembly
-from ..mechanism.dynamics import dependent_rates, NEAR_ALIGNMENT, reduced_form
-from ..mechanism.parameters import Array
-from .allocation import minimum_norm
-from .reference import SoftStep
-from .setpoint import check_move, check_names, resolve, SetpointError
 
 # A setpoint with a stamp (not zero, which means now) may be this far from the last tick [s].
 SETPOINT_TIMEOUT = 1.0
@@ -111,7 +110,7 @@ class Controller:
         # Compile the kernels now, not while time runs.
         square = np.array([0.0, pi / 2.0, 0.0, pi / 2.0])
         reduced_form(mechanism, square, np.zeros(2))
-        dependent_rates(*square, mechanism.constants.lengths)
+        gamma_matrix(square, mechanism.constants.lengths)
 
     def device_armed(self, armed: bool) -> None:
         """Follow the device's arming state."""
@@ -195,12 +194,11 @@ class Controller:
             self._move, self.mode = None, 'hold'
 
     def _reference_rates(self) -> Array:
-        a, b, c, d = self._reference_angles
         rates = self._reference[1]
-        if not rates.any() or abs(sin(d - c)) < NEAR_ALIGNMENT:
-            return np.concatenate([rates, rates])
-        gamma = np.array(dependent_rates(
-            a, b, c, d, self._mechanism.constants.lengths)).reshape(2, 2)
+        if not rates.any():
+            return np.zeros(4)
+        # A planned move keeps its distance from change points, so Gamma exists here.
+        gamma = gamma_matrix(self._reference_angles, self._mechanism.constants.lengths)
         return np.concatenate([rates, gamma @ rates])
 
     def _torques(self, link_angles: Array, link_rates: Array, angle_errors: Array,

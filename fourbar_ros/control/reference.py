@@ -18,9 +18,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fourbar_ros.mechanism.parameters import Array
 import numpy as np
-
-from ..mechanism.parameters import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,13 +19,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import isfinite, sin
 
+from fourbar_ros.control.reference import SoftStep
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism import branch_of, ClosureError, LINK_NAMES, Mechanism, nearest_assembly
+from fourbar_ros.mechanism.angles import wrap
+from fourbar_ros.mechanism.parameters import Array
 import numpy as np
-
-from ..errors import FourbarError
-from ..mechanism import branch_of, ClosureError, LINK_NAMES, Mechanism, nearest_assembly
-from ..mechanism.angles import wrap
-from ..mechanism.parameters import Array
-from .reference import SoftStep
 
 # Closest approach to a change point that a move may plan, as |sin(phi_d - phi_c)|: there the
 # wheels' hold on the configuration is lost.

@@ -14,12 +14,12 @@
 
 """What a testbed is, simulated or real: samples in, torques out, and when it may be driven."""
 
-from .command import CommandError, torques_by_name
-from .gate import ArmingGate, DeviceState
-from .pacing import RealtimePace
-from .protocol import Device, LinkSample, Samples, WheelSample
-from .simulated import SimulatedTable
-from .testbed import Testbed, TestbedSettings, Timing
+from fourbar_ros.device.command import CommandError, torques_by_name
+from fourbar_ros.device.gate import ArmingGate, DeviceState
+from fourbar_ros.device.pacing import RealtimePace
+from fourbar_ros.device.protocol import Device, LinkSample, Samples, WheelSample
+from fourbar_ros.device.simulated import SimulatedTable
+from fourbar_ros.device.testbed import Testbed, TestbedSettings, Timing
 
 __all__ = [
     'ArmingGate', 'CommandError', 'Device', 'DeviceState', 'LinkSample', 'RealtimePace',

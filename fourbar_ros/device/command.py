@@ -18,11 +18,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism import FLYWHEEL_NAMES
+from fourbar_ros.mechanism.parameters import Array
 import numpy as np
-
-from ..errors import FourbarError
-from ..mechanism import FLYWHEEL_NAMES
-from ..mechanism.parameters import Array
 
 
 class CommandError(FourbarError):

@@ -19,9 +19,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from ..mechanism import Mechanism
-from ..mechanism.parameters import Array
-from ..plant import Truth
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.parameters import Array
+from fourbar_ros.plant import Truth
 
 
 @dataclass(frozen=True, eq=False)

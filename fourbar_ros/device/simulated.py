@@ -16,9 +16,9 @@
 
 from __future__ import annotations
 
-from ..mechanism.parameters import Array
-from ..plant import Plant
-from .protocol import LinkSample, Samples, WheelSample
+from fourbar_ros.device.protocol import LinkSample, Samples, WheelSample
+from fourbar_ros.mechanism.parameters import Array
+from fourbar_ros.plant import Plant
 
 ALL_LINKS = (0, 1, 2, 3)
 

@@ -25,14 +25,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from fourbar_ros.device.command import CommandError, torques_by_name
+from fourbar_ros.device.gate import ArmingGate
+from fourbar_ros.device.protocol import Device, Samples
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism import LINK_NAMES
+from fourbar_ros.mechanism.parameters import Array
 import numpy as np
-
-from ..errors import FourbarError
-from ..mechanism import LINK_NAMES
-from ..mechanism.parameters import Array
-from .command import CommandError, torques_by_name
-from .gate import ArmingGate
-from .protocol import Device, Samples
 
 TIMEOUT_ACTIONS = ('coast', 'hold_speed', 'brake')
 
@@ -161,7 +160,7 @@ class Testbed:
             self._round_trip_ns = steady_ns - self._published_steady_ns
         self._torques[:] = limited
 
-    def arm(self, stamp_ns: int, steady_ns: int, obstacles: Sequence[str]) -> tuple[bool, str]:
+    def arm(self, steady_ns: int, obstacles: Sequence[str]) -> tuple[bool, str]:
         """
         Ask to drive the wheels.
 
@@ -170,27 +169,45 @@ class Testbed:
         """
         silent = [name for name, seen_ns in zip(LINK_NAMES, self._link_seen_ns)
                   if seen_ns is None
-                  or stamp_ns - seen_ns > self._settings.sensor_timeout_s * 1e9]
+                  or self._now_ns - seen_ns > self._settings.sensor_timeout_s * 1e9]
         if silent:
             obstacles = [*obstacles, f'no sample from {", ".join(silent)} for '
                                      f'{self._settings.sensor_timeout_s:g} s']
         was_armed = self.gate.armed
-        armed, message = self.gate.arm(stamp_ns, obstacles)
+        armed, message = self.gate.arm(self._now_ns, obstacles)
         if armed and not was_armed:
             self._armed_steady_ns = steady_ns
             self._parked_speeds = None
             self._torques[:] = 0.0
         return armed, message
 
-    def disarm(self, stamp_ns: int, reason: str) -> None:
+    def disarm(self, reason: str) -> None:
         """Stop driving: the wheels coast."""
         self._parked_speeds = None
-        self.gate.disarm(stamp_ns, reason)
+        self.gate.disarm(self._now_ns, reason)
 
-    def emergency_stop(self, stamp_ns: int, reason: str) -> None:
+    def emergency_stop(self, reason: str) -> None:
         """Stop driving until reset: the wheels coast."""
         self._parked_speeds = None
-        self.gate.emergency_stop(stamp_ns, reason)
+        self.gate.emergency_stop(self._now_ns, reason)
+
+    def reset(self) -> tuple[bool, str]:
+        """Release emergency stop or fault; the wheels stay disarmed."""
+        return self.gate.reset(self._now_ns)
+
+    def diagnosis(self) -> dict[str, object]:
+        """Tell what a person wants to know when something is wrong."""
+        return {
+            'state': self.gate.state.value, 'reason': self.gate.reason,
+            'ticks_lost': self._lost, 'commands_clipped': self.clipped,
+            'last_rejection': self.last_rejection,
+            **{f'commands_rejected_{kind}': count
+               for kind, count in sorted(self.rejected.items())}}
+
+    @property
+    def _now_ns(self) -> int:
+        """Return the stamp of the last tick, 0 before the first [ns]."""
+        return 0 if self._tick_ns is None else self._tick_ns
 
     def _check_stamp(self, stamp_ns: int) -> None:
         if self._tick_ns is None:

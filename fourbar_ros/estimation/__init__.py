@@ -14,6 +14,6 @@
 
 """What we believe: the Kalman filter on link angles and wheel motion."""
 
-from .estimator import Estimate, Estimator, EstimatorSettings, Innovation
+from fourbar_ros.estimation.estimator import Estimate, Estimator, EstimatorSettings, Innovation
 
 __all__ = ['Estimate', 'Estimator', 'EstimatorSettings', 'Innovation']

@@ -21,13 +21,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite, pi
 
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.estimation.filter import LinkageFilter
+from fourbar_ros.mechanism import ClosureError, LINK_NAMES, Mechanism, nearest_assembly
+from fourbar_ros.mechanism.angles import wrap_angles
+from fourbar_ros.mechanism.parameters import Array
 import numpy as np
-
-from ..errors import FourbarError
-from ..mechanism import ClosureError, LINK_NAMES, Mechanism, nearest_assembly
-from ..mechanism.angles import wrap_angles
-from ..mechanism.parameters import Array
-from .filter import LinkageFilter
 
 # A longer silence, or time going back, means another run of the device: start again.
 LONGEST_GAP_NS = 1_000_000_000

@@ -27,16 +27,18 @@ good Gamma is kept, which is exact for a parallelogram.
 from __future__ import annotations
 
 from filterpy.kalman import ExtendedKalmanFilter
-import numpy as np
-
-from ..mechanism import Mechanism
-from ..mechanism.angles import wrap_angles
-from ..mechanism.compiled import kernel
-from ..mechanism.dynamics import (
-    dependent_rates, mass_matrix, NEAR_ALIGNMENT, project_onto_closure,
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.angles import wrap_angles
+from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.mechanism.dynamics import (
+    gamma_matrix,
+    mass_matrix,
+    NEAR_ALIGNMENT,
+    project_onto_closure,
 )
-from ..mechanism.motion import advance_state, LINK_ANGLES, LINK_RATES, STATE_SIZE
-from ..mechanism.parameters import Array, Constants
+from fourbar_ros.mechanism.motion import advance_state, LINK_ANGLES, LINK_RATES, STATE_SIZE
+from fourbar_ros.mechanism.parameters import Array, Constants
+import numpy as np
 
 # Half width of the central differences for the transition matrix [rad], [rad/s].
 DIFFERENCE = 1e-6
@@ -76,9 +78,9 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
     def sigmas(self) -> tuple[Array, Array]:
         """Return one standard deviation of the four angles [rad] and rates [rad/s]: two (4,)."""
         to_links = np.vstack([np.eye(2), self.gamma])
-        return tuple(  # type: ignore[return-value]
-            np.sqrt(np.einsum('ij,jk,ik->i', to_links, block, to_links))
-            for block in (self.P[:2, :2], self.P[2:, 2:]))
+        angles = np.einsum('ij,jk,ik->i', to_links, self.P[:2, :2], to_links)
+        rates = np.einsum('ij,jk,ik->i', to_links, self.P[2:, 2:], to_links)
+        return np.sqrt(angles), np.sqrt(rates)
 
     def move(self, duration: float, wheel_torques: Array) -> None:
         """
@@ -128,8 +130,7 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
 
     def _refresh_gamma(self) -> None:
         if abs(np.sin(self.angles[3] - self.angles[2])) > NEAR_ALIGNMENT:
-            self.gamma = np.array(
-                dependent_rates(*self.angles, self._constants.lengths)).reshape(2, 2)
+            self.gamma = gamma_matrix(self.angles, self._constants.lengths)
 
 
 @kernel

@@ -14,6 +14,6 @@
 
 """Device, estimator and controller stepped in one process, without ROS."""
 
-from .closed_loop import ClosedLoop, Step
+from fourbar_ros.loop.closed_loop import ClosedLoop, Step
 
 __all__ = ['ClosedLoop', 'Step']

@@ -23,10 +23,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..control import Control, Controller
-from ..device import Samples, Testbed
-from ..estimation import Estimate, Estimator
-from ..mechanism import FLYWHEEL_NAMES, LINK_NAMES
+from fourbar_ros.control import Control, Controller
+from fourbar_ros.device import Samples, Testbed
+from fourbar_ros.estimation import Estimate, Estimator
+from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES
 
 FIRST_STAMP_NS = 1_000_000_000
 
@@ -79,5 +79,4 @@ class ClosedLoop:
 
     def arm(self) -> tuple[bool, str]:
         """Arm the testbed at the last tick."""
-        stamp_ns = self._next_ns - self.testbed.device.period_ns
-        return self.testbed.arm(stamp_ns, stamp_ns, ())
+        return self.testbed.arm(self._next_ns - self.testbed.device.period_ns, ())

@@ -16,16 +16,14 @@
 
 from __future__ import annotations
 
+from fourbar_ros.control import Controller, ControllerSettings
+from fourbar_ros.device import SimulatedTable, Testbed, TestbedSettings
+from fourbar_ros.estimation import Estimator, EstimatorSettings
+from fourbar_ros.loop.closed_loop import ClosedLoop
+from fourbar_ros.mechanism import load_mechanism
+from fourbar_ros.mechanism.compiled import cache_directory
+from fourbar_ros.plant import InitialState, load_table, Plant
 import numpy as np
-
-from ..control import Controller, ControllerSettings
-from ..device import SimulatedTable, Testbed, TestbedSettings
-from ..estimation import Estimator, EstimatorSettings
-from ..mechanism import Mechanism
-from ..mechanism.compiled import cache_directory
-from ..plant import InitialState, Plant
-from ..plant.table import LinkSensors, Table, WheelEncoders
-from .closed_loop import ClosedLoop
 
 
 def is_cold() -> bool:
@@ -36,10 +34,8 @@ def is_cold() -> bool:
 
 def warm_up() -> None:
     """Go through a few ticks of a closed loop; the compiled code stays in the cache."""
-    mechanism = Mechanism(  # type: ignore[arg-type]
-        [0.1] * 4, [0.02] * 4, [2.2e-5] * 4, [[0.05, 0.0]] * 4, [3.4e-7] * 4)
-    plant = Plant(mechanism, Table(LinkSensors(0.0, 0), WheelEncoders(0)), InitialState(), 1e-3,
-                  np.random.default_rng(0))
+    mechanism = load_mechanism('paper')
+    plant = Plant(mechanism, load_table('ideal'), InitialState(), 1e-3, np.random.default_rng(0))
     loop = ClosedLoop(
         Testbed(SimulatedTable(plant, 1_000_000), TestbedSettings()),
         Estimator(mechanism, EstimatorSettings()), Controller(mechanism, ControllerSettings()))

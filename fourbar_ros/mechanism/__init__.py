@@ -19,11 +19,26 @@ Conventions are those of docs/mechanics.md: links a, b, c, d in this order, link
 the link's x axis in the table frame, wheel speed relative to its link unless called absolute.
 """
 
-from .closure import assemble, branch_of, closure_error, ClosureError, nearest_assembly
-from .dynamics import angular_momentum, kinetic_energy, reduced_form, ReducedForm
-from .geometry import com_positions_in_table, joint_positions
-from .parameters import (
-    FLYWHEEL_NAMES, LINK_NAMES, load_mechanism, Mechanism, MechanismError,
+from fourbar_ros.mechanism.closure import (
+    assemble,
+    branch_of,
+    closure_error,
+    ClosureError,
+    nearest_assembly,
+)
+from fourbar_ros.mechanism.dynamics import (
+    angular_momentum,
+    kinetic_energy,
+    reduced_form,
+    ReducedForm,
+)
+from fourbar_ros.mechanism.geometry import com_positions_in_table, joint_positions
+from fourbar_ros.mechanism.parameters import (
+    FLYWHEEL_NAMES,
+    LINK_NAMES,
+    load_mechanism,
+    Mechanism,
+    MechanismError,
 )
 
 __all__ = [

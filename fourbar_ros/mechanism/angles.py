@@ -18,10 +18,9 @@ from __future__ import annotations
 
 from math import pi
 
+from fourbar_ros.mechanism.parameters import Array
 import numpy as np
 from numpy.typing import ArrayLike
-
-from .parameters import Array
 
 
 def wrap(angle: float) -> float:

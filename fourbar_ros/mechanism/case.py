@@ -29,15 +29,19 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ..errors import FourbarError
-from .closure import closure_error
-from .dynamics import closure_derivatives
-from .motion import (
-    LINK_ANGLES, LINK_RATES, move_with_cosine_torques, STATE_SIZE, WHEEL_ANGLES, WHEEL_SPEEDS,
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism.closure import closure_error
+from fourbar_ros.mechanism.dynamics import closure_derivatives
+from fourbar_ros.mechanism.motion import (
+    LINK_ANGLES,
+    LINK_RATES,
+    move_with_cosine_torques,
+    STATE_SIZE,
+    WHEEL_ANGLES,
+    WHEEL_SPEEDS,
 )
-from .parameters import Array, LINK_NAMES, Mechanism
+from fourbar_ros.mechanism.parameters import Array, LINK_NAMES, Mechanism
+import numpy as np
 
 # How far an initial state may be off the closure, relative to the longest link (and per second):
 # generous to files with rounded digits, far below any real mistake.

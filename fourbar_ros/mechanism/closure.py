@@ -17,20 +17,19 @@ Loop closure: `l_b e(phi_b) + l_c e(phi_c) = l_a e(phi_a) + l_d e(phi_d)` and it
 
 For given (phi_a, phi_b) joint 3 lies on either side of the diagonal from joint 2 to joint 4. The
 assembly is *open* where joints 1 and 3 are on opposite sides of it, *crossed* where they are on
-the same side. Along a motion the side of joint 3, `sign(sin(phi_d - phi_c))`, can change only where
-c and d fold onto a line (a change point).
+the same side. Along a motion the side of joint 3, `sign(sin(phi_d - phi_c))`, can change only
+where c and d fold onto a line (a change point).
 """
 
 from __future__ import annotations
 
 from math import acos, atan2, cos, hypot, pi, sin
 
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism.angles import wrap
+from fourbar_ros.mechanism.parameters import Array, LINK_NAMES, Mechanism
 import numpy as np
 from numpy.typing import ArrayLike
-
-from ..errors import FourbarError
-from .angles import wrap
-from .parameters import Array, LINK_NAMES, Mechanism
 
 BRANCHES = ('open', 'crossed')
 

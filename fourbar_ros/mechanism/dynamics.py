@@ -31,11 +31,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import cos, hypot, sin, sqrt
 
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.mechanism.parameters import Array, Constants, Mechanism
 import numpy as np
 from numpy.typing import ArrayLike
-
-from .compiled import kernel
-from .parameters import Array, Constants, Mechanism
 
 # Below this |sin(phi_d - phi_c)| the constraint forces come from the pseudo-inverse: the reduced
 # form loses about 1 / |sin|^2 in accuracy.
@@ -47,7 +47,7 @@ LOST_FOR_FORCES = 1e-9
 LOST_FOR_PROJECTION = 1e-3
 
 
-class ChangePointError(ArithmeticError):
+class ChangePointError(FourbarError):
     """Gamma, and with it the reduced form, does not exist at a change point."""
 
 
@@ -146,9 +146,16 @@ def centripetal_bias(angles: Array, rates: Array, constants: Constants) -> Array
 
 
 @kernel
-def dependent_rates(phi_a: float, phi_b: float, phi_c: float, phi_d: float,
-                    lengths: Array) -> tuple[float, float, float, float]:
+def gamma_matrix(angles: Array, lengths: Array) -> Array:
+    """Evaluate Gamma (2, 2): (omega_c, omega_d) = Gamma (omega_a, omega_b)."""
+    g1, g2, g3, g4 = dependent_rates(angles, lengths)
+    return np.array([[g1, g2], [g3, g4]])
+
+
+@kernel
+def dependent_rates(angles: Array, lengths: Array) -> tuple[float, float, float, float]:
     """Evaluate Gamma: omega_c = g1 omega_a + g2 omega_b, omega_d = g3 omega_a + g4 omega_b."""
+    phi_a, phi_b, phi_c, phi_d = angles[0], angles[1], angles[2], angles[3]
     fold = sin(phi_d - phi_c)
     over_c = 1.0 / (lengths[2] * fold)
     over_d = 1.0 / (lengths[3] * fold)
@@ -408,7 +415,7 @@ def project_onto_closure(angles: Array, rates: Array, constants: Constants) -> N
         along_c = gap_x * cos(angles[2]) + gap_y * sin(angles[2])
         angles[2] -= along_d / (lengths[2] * fold)
         angles[3] -= along_c / (lengths[3] * fold)
-        g1, g2, g3, g4 = dependent_rates(angles[0], angles[1], angles[2], angles[3], lengths)
+        g1, g2, g3, g4 = dependent_rates(angles, lengths)
         rates[2] = g1 * rates[0] + g2 * rates[1]
         rates[3] = g3 * rates[0] + g4 * rates[1]
         return

@@ -16,10 +16,9 @@
 
 from __future__ import annotations
 
+from fourbar_ros.mechanism.parameters import Array, Mechanism
 import numpy as np
 from numpy.typing import ArrayLike
-
-from .parameters import Array, Mechanism
 
 
 def joint_positions(mechanism: Mechanism, link_angles: ArrayLike) -> Array:

@@ -24,11 +24,10 @@ from __future__ import annotations
 
 from math import ceil, cos, pi
 
+from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.mechanism.dynamics import link_accelerations, project_onto_closure
+from fourbar_ros.mechanism.parameters import Array, Constants
 import numpy as np
-
-from .compiled import kernel
-from .dynamics import link_accelerations, project_onto_closure
-from .parameters import Array, Constants
 
 STATE_SIZE = 16
 LINK_ANGLES = slice(0, 4)

@@ -21,11 +21,10 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, NamedTuple
 
+from fourbar_ros.configuration import config_file, load_yaml
+from fourbar_ros.errors import FourbarError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from ..configuration import config_file, load_yaml
-from ..errors import FourbarError
 
 LINK_NAMES = ('link_a', 'link_b', 'link_c', 'link_d')
 FLYWHEEL_NAMES = ('flywheel_a', 'flywheel_b', 'flywheel_c', 'flywheel_d')

@@ -19,8 +19,16 @@ from fourbar_ros.control import Controller, ControllerSettings, SetpointError
 from fourbar_ros.loop.pairing import StampPairs
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism
 from fourbar_ros.nodes.messages import (
-    Diagnostics, JointStatePublisher, LATCHED, OK, RareLog, RELIABLE, SENSOR, stamp_of,
-    status_message, WARN,
+    Diagnostics,
+    JointStatePublisher,
+    LATCHED,
+    OK,
+    RareLog,
+    RELIABLE,
+    SENSOR,
+    stamp_of,
+    status_message,
+    WARN,
 )
 from fourbar_ros.nodes.parameters import declare, Parameter
 from fourbar_ros.nodes.runtime import run_node
@@ -125,7 +133,7 @@ class ControllerNode(Node):
         goal = '' if controller.goal is None else ' '.join(
             f'{name}={angle:.6f}' for name, angle in zip(LINK_NAMES, controller.goal))
         self._status.publish(status_message(
-            self.get_fully_qualified_name().lstrip('/'), '', OK, controller.mode, {
+            self, '', OK, controller.mode, {
                 'mode': controller.mode, 'goal': goal,
                 'setpoint_duration_s': controller.settings.setpoint_duration,
                 'accepted': controller.accepted, 'refused': controller.refused,

@@ -22,16 +22,23 @@ from fourbar_ros.device.gate import DeviceState
 from fourbar_ros.device.testbed import TIMEOUT_ACTIONS
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES
+from fourbar_ros.nodes.gate_services import GateServices
 from fourbar_ros.nodes.messages import (
-    Diagnostics, ERROR, JointStatePublisher, LATCHED, OK, RareLog, RELIABLE, stamp_of,
-    status_message, WARN,
+    Diagnostics,
+    ERROR,
+    JointStatePublisher,
+    LATCHED,
+    OK,
+    RareLog,
+    RELIABLE,
+    stamp_of,
+    status_message,
+    WARN,
 )
 from fourbar_ros.nodes.parameters import declare, Parameter
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool
-from std_srvs.srv import SetBool, Trigger
 
 PARAMETERS = (
     Parameter('mechanism', 'paper', '', 'preset or path of a mechanism file'),
@@ -69,7 +76,6 @@ class DeviceNode(Node):
         self._testbed = Testbed(make_device(values, period_ns), TestbedSettings(
             values['command_timeout'], values['sensor_timeout'], values['timeout_action']))
         self._log = RareLog(self)
-        self._stamp_ns = 0
         self._announced = None
 
         self._links = JointStatePublisher(self, 'link_angles', LINK_NAMES, ('position',))
@@ -79,17 +85,11 @@ class DeviceNode(Node):
         self._status = self.create_publisher(DiagnosticStatus, 'device_status', LATCHED)
         self.create_subscription(
             JointState, 'flywheel_command', guard(self._on_command), RELIABLE)
-        self.create_subscription(
-            Bool, 'emergency_stop_request', guard(self._on_stop_request), RELIABLE)
-        self.create_service(SetBool, 'arm', guard(self._on_arm))
-        self.create_service(Trigger, 'emergency_stop', guard(self._on_stop))
-        self.create_service(Trigger, 'reset_emergency_stop', guard(self._on_reset))
+        GateServices(self, self._testbed, guard, self._announce)
         device = self._testbed.device
         self._diagnostics = Diagnostics(self, device.description, self._collect, guard)
+        self._pace = RealtimePace(time.time_ns(), time.monotonic_ns(), period_ns, PATIENCE_NS)
         self._announce()
-
-        self._pace = RealtimePace(
-            time.time_ns(), time.monotonic_ns(), period_ns, PATIENCE_NS)
         self.create_timer(period_ns * 1e-9, guard(self._on_timer),
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(
@@ -100,7 +100,7 @@ class DeviceNode(Node):
 
     def close(self):
         """Leave the wheels without torque, and say so."""
-        self._testbed.disarm(self._stamp_ns, 'the node ends')
+        self._testbed.disarm('the node ends')
         self._announce()
 
     def _on_timer(self):
@@ -117,7 +117,6 @@ class DeviceNode(Node):
             self.get_logger().error(f'{error}: the device stands still')
             return
         step_ns = time.monotonic_ns() - begin_ns
-        self._stamp_ns = stamp_ns
         for sample in samples.links:
             self._links.publish(sample.stamp_ns, sample.angles,
                                 names=tuple(LINK_NAMES[link] for link in sample.links))
@@ -141,38 +140,6 @@ class DeviceNode(Node):
         if self._testbed.clipped > clipped:
             self._log.warn('flywheel_command asks more torque than a motor has: clipped')
 
-    def _on_stop_request(self, message):
-        if message.data:
-            self._testbed.emergency_stop(self._stamp_ns, 'emergency_stop_request')
-            self._announce()
-
-    def _on_arm(self, request, response):
-        if request.data:
-            obstacles = []
-            for topic in ('flywheel_command', 'link_angles'):
-                publishers = self.count_publishers(self.resolve_topic_name(topic))
-                if publishers > 1:
-                    obstacles.append(f'{topic} has {publishers} publishers, limit 1')
-            response.success, response.message = self._testbed.arm(
-                self._stamp_ns, time.monotonic_ns(), obstacles)
-        else:
-            self._testbed.disarm(self._stamp_ns, 'disarmed on request')
-            response.success = True
-            response.message = self._testbed.gate.state.value
-        self._announce()
-        return response
-
-    def _on_stop(self, _request, response):
-        self._testbed.emergency_stop(self._stamp_ns, 'emergency_stop service')
-        response.success, response.message = True, 'stopped, the wheels coast'
-        self._announce()
-        return response
-
-    def _on_reset(self, _request, response):
-        response.success, response.message = self._testbed.gate.reset(self._stamp_ns)
-        self._announce()
-        return response
-
     def _announce(self):
         """Publish the gate's state if it changed."""
         gate = self._testbed.gate
@@ -181,24 +148,16 @@ class DeviceNode(Node):
             return
         self._announced = present
         self._status.publish(status_message(
-            self.get_fully_qualified_name().lstrip('/'), self._testbed.device.description,
-            LEVELS[gate.state], f'{gate.state.value}: {gate.reason}', {
+            self, self._testbed.device.description, LEVELS[gate.state],
+            f'{gate.state.value}: {gate.reason}', {
                 'state': gate.state.value, 'reason': gate.reason,
                 'since': f'{gate.since_ns * 1e-9:.9f}', 'mechanism': self._mechanism}))
         self._diagnostics.changed()
         self.get_logger().info(f'{gate.state.value}: {gate.reason}')
 
     def _collect(self):
-        testbed = self._testbed
-        level, summary = LEVELS[testbed.gate.state], testbed.gate.state.value
-        if testbed.rejected and level == OK:
+        gate = self._testbed.gate
+        level, summary = LEVELS[gate.state], gate.state.value
+        if self._testbed.rejected and level == OK:
             level, summary = WARN, f'{summary}, commands were rejected'
-        values = {'state': testbed.gate.state.value, 'reason': testbed.gate.reason,
-                  'commands_clipped': testbed.clipped, 'ticks_skipped': self._pace_skipped(),
-                  'last_rejection': testbed.last_rejection}
-        values.update((f'commands_rejected_{kind}', count)
-                      for kind, count in sorted(testbed.rejected.items()))
-        return level, summary, values
-
-    def _pace_skipped(self):
-        return self._pace.skipped if hasattr(self, '_pace') else 0
+        return level, summary, {**self._testbed.diagnosis(), 'ticks_skipped': self._pace.skipped}

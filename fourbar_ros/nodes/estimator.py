@@ -18,7 +18,13 @@ from fourbar_ros.estimation import Estimator, EstimatorSettings
 from fourbar_ros.estimation.estimator import MeasurementError
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism
 from fourbar_ros.nodes.messages import (
-    Diagnostics, JointStatePublisher, OK, RareLog, SENSOR, stamp_of, WARN,
+    Diagnostics,
+    JointStatePublisher,
+    OK,
+    RareLog,
+    SENSOR,
+    stamp_of,
+    WARN,
 )
 from fourbar_ros.nodes.parameters import declare, Parameter
 from fourbar_ros.nodes.runtime import run_node

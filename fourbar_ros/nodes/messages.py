@@ -74,8 +74,9 @@ class JointStatePublisher:
         self._publisher.publish(self._message)
 
 
-def status_message(name, hardware, level, summary, values):
-    """Make a DiagnosticStatus; `values` is a dict of anything that has a text."""
+def status_message(node, hardware, level, summary, values):
+    """Make a node's DiagnosticStatus; `values` is a dict of anything that has a text."""
+    name = node.get_fully_qualified_name().lstrip('/')
     return DiagnosticStatus(
         level=level, name=name, message=summary, hardware_id=hardware,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
@@ -107,8 +108,7 @@ class Diagnostics:
         self._last = level, summary
         array = DiagnosticArray()
         array.header.stamp = self._node.get_clock().now().to_msg()
-        name = self._node.get_fully_qualified_name().lstrip('/')
-        array.status = [status_message(name, self._hardware, level, summary, values)]
+        array.status = [status_message(self._node, self._hardware, level, summary, values)]
         self._publisher.publish(array)
 
 

@@ -20,7 +20,9 @@ import signal
 from fourbar_ros.nodes.environment import RosError
 import rclpy
 from rclpy.exceptions import (
-    InvalidNamespaceException, InvalidNodeNameException, InvalidTopicNameException,
+    InvalidNamespaceException,
+    InvalidNodeNameException,
+    InvalidTopicNameException,
     ParameterException,
 )
 from rclpy.experimental.events_executor import EventsExecutor
@@ -45,7 +47,7 @@ class Runtime:
             signal.signal(number, self._stop)
         try:
             rclpy.init(args=list(ros_args), signal_handler_options=SignalHandlerOptions.NO)
-        except Exception as error:  # noqa: B902 - rcl's errors have no common class
+        except Exception as error:  # noqa: BLE001 - rcl's errors have no common class
             raise RosError(_first_line(error)) from None
         self.executor = EventsExecutor()
 
@@ -57,7 +59,7 @@ class Runtime:
         def guarded(*args):
             try:
                 return callback(*args)
-            except Exception as error:  # noqa: B902 - whatever it is, the node must end cleanly
+            except Exception as error:  # noqa: BLE001 - whatever it is, the node must end cleanly
                 self.failure = self.failure or error
                 return args[1] if len(args) > 1 else None
         return guarded

@@ -14,7 +14,7 @@
 
 """What the table does: the moving linkage, its flywheel motors and its sensors."""
 
-from .plant import InitialState, Plant, PlantError, Truth
-from .table import load_table, Table, TableError
+from fourbar_ros.plant.plant import InitialState, Plant, PlantError, Truth
+from fourbar_ros.plant.table import load_table, Table, TableError
 
 __all__ = ['InitialState', 'load_table', 'Plant', 'PlantError', 'Table', 'TableError', 'Truth']

@@ -24,18 +24,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import isfinite
 
-import numpy as np
-
-from ..errors import FourbarError
-from ..mechanism import assemble, LINK_NAMES, Mechanism
-from ..mechanism.angles import wrap_angles
-from ..mechanism.compiled import kernel
-from ..mechanism.dynamics import dependent_rates
-from ..mechanism.motion import (
-    advance_state, LINK_ANGLES, LINK_RATES, STATE_SIZE, WHEEL_ANGLES, WHEEL_SPEEDS,
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism import assemble, LINK_NAMES, Mechanism
+from fourbar_ros.mechanism.angles import wrap_angles
+from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.mechanism.dynamics import gamma_matrix
+from fourbar_ros.mechanism.motion import (
+    advance_state,
+    LINK_ANGLES,
+    LINK_RATES,
+    STATE_SIZE,
+    WHEEL_ANGLES,
+    WHEEL_SPEEDS,
 )
-from ..mechanism.parameters import Array, Constants
-from .table import quantum, Table
+from fourbar_ros.mechanism.parameters import Array, Constants
+from fourbar_ros.plant.table import quantum, Table
+import numpy as np
 
 
 class PlantError(FourbarError):
@@ -198,9 +202,7 @@ def _initial_state(mechanism: Mechanism, initial: InitialState) -> Array:
             raise PlantError(
                 f'initial rates are given at a change point ({LINK_NAMES[2]} and {LINK_NAMES[3]} '
                 'on a line), where they do not determine the motion')
-        g1, g2, g3, g4 = dependent_rates(*angles, mechanism.constants.lengths)
-        rates[2] = g1 * rates[0] + g2 * rates[1]
-        rates[3] = g3 * rates[0] + g4 * rates[1]
+        rates[2:] = gamma_matrix(angles, mechanism.constants.lengths) @ rates[:2]
     state = np.zeros(STATE_SIZE)
     state[LINK_ANGLES] = angles
     state[LINK_RATES] = rates

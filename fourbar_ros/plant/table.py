@@ -21,8 +21,8 @@ from dataclasses import dataclass, fields
 from math import isfinite, pi
 from typing import Any
 
-from ..configuration import config_file, load_yaml
-from ..errors import FourbarError
+from fourbar_ros.configuration import config_file, load_yaml
+from fourbar_ros.errors import FourbarError
 
 
 class TableError(FourbarError):

@@ -18,10 +18,16 @@ from itertools import combinations
 from math import acos, inf, isclose, pi
 
 from fourbar_ros.mechanism import (
-    assemble, branch_of, closure_error, ClosureError, Mechanism, nearest_assembly,
+    assemble,
+    branch_of,
+    closure_error,
+    ClosureError,
+    Mechanism,
+    nearest_assembly,
 )
 from fourbar_ros.mechanism.closure import BRANCHES, solve_pair, wrap
-from hypothesis import assume, given, settings, strategies as st
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 import numpy as np
 from numpy.typing import NDArray
 import pytest

@@ -18,14 +18,25 @@ from collections.abc import Callable
 from typing import Any
 
 from fourbar_ros.mechanism import (
-    angular_momentum, kinetic_energy, load_mechanism, Mechanism, reduced_form,
+    angular_momentum,
+    kinetic_energy,
+    load_mechanism,
+    Mechanism,
+    reduced_form,
 )
 from fourbar_ros.mechanism.dynamics import (
-    _constrained_accelerations, _reduced_accelerations, ChangePointError, link_accelerations,
+    _constrained_accelerations,
+    _reduced_accelerations,
+    ChangePointError,
+    link_accelerations,
     mass_matrix,
 )
 from fourbar_ros.mechanism.motion import (
-    LINK_ANGLES, LINK_RATES, state_derivative, WHEEL_ANGLES, WHEEL_SPEEDS,
+    LINK_ANGLES,
+    LINK_RATES,
+    state_derivative,
+    WHEEL_ANGLES,
+    WHEEL_SPEEDS,
 )
 import numpy as np
 from numpy.typing import NDArray

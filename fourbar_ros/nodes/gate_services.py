@@ -1,0 +1,77 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The arming gate of a testbed as services, and the topic that stops it."""
+
+import time
+
+from fourbar_ros.nodes.messages import RELIABLE
+from std_msgs.msg import Bool
+from std_srvs.srv import SetBool, Trigger
+
+# More than one publisher of these means that somebody would be driven by the wrong one.
+SINGLE_PUBLISHER = ('flywheel_command', 'link_angles')
+
+
+class GateServices:
+    """
+    Let people arm, disarm, stop and reset.
+
+    :param announce: called after every change.
+    """
+
+    def __init__(self, node, testbed, guard, announce):
+        self._node = node
+        self._testbed = testbed
+        self._announce = announce
+        node.create_service(SetBool, 'arm', guard(self._on_arm))
+        node.create_service(Trigger, 'emergency_stop', guard(self._on_stop))
+        node.create_service(Trigger, 'reset_emergency_stop', guard(self._on_reset))
+        node.create_subscription(
+            Bool, 'emergency_stop_request', guard(self._on_stop_request), RELIABLE)
+
+    def _on_arm(self, request, response):
+        if request.data:
+            response.success, response.message = self._testbed.arm(
+                time.monotonic_ns(), self._obstacles())
+        else:
+            self._testbed.disarm('disarmed on request')
+            response.success = True
+            response.message = self._testbed.gate.state.value
+        self._announce()
+        return response
+
+    def _obstacles(self):
+        found = []
+        for topic in SINGLE_PUBLISHER:
+            publishers = self._node.count_publishers(self._node.resolve_topic_name(topic))
+            if publishers > 1:
+                found.append(f'{topic} has {publishers} publishers, limit 1')
+        return found
+
+    def _on_stop(self, _request, response):
+        self._testbed.emergency_stop('emergency_stop service')
+        response.success, response.message = True, 'stopped, the wheels coast'
+        self._announce()
+        return response
+
+    def _on_reset(self, _request, response):
+        response.success, response.message = self._testbed.reset()
+        self._announce()
+        return response
+
+    def _on_stop_request(self, message):
+        if message.data:
+            self._testbed.emergency_stop('emergency_stop_request')
+            self._announce()

@@ -1,0 +1,36 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The bags of known motions, for the tests of this folder."""
+
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope='session')
+def synthetic():
+    """Return the module that writes bags (tests are no package: it cannot be imported)."""
+    spec = spec_from_file_location('synthetic', Path(__file__).with_name('synthetic.py'))
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope='session')
+def motion_bag(synthetic, tmp_path_factory):
+    """Return the bag of the whole motion at 50 Hz."""
+    return synthetic.write_bag(
+        tmp_path_factory.mktemp('motion') / 'bag', synthetic.motion_messages())

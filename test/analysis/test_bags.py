@@ -1,0 +1,162 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A bag comes back as it was written, or with one line that says why not."""
+
+from fourbar_ros.analysis.bags import BagError, read_bag
+from fourbar_ros.errors import FourbarError
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+
+LINKS = ('link_a', 'link_b', 'link_c', 'link_d')
+
+
+@pytest.mark.parametrize('storage', list(StoragePlugin), ids=lambda plugin: plugin.name)
+def test_values_come_back_exactly(synthetic, tmp_path, storage):
+    values = np.random.default_rng(1).standard_normal((20, 3, 4))
+    stamps = 10**18 + np.arange(20) * 4_000_001  # beyond what a float holds
+    bag = synthetic.write_bag(tmp_path / 'bag', {'/reference': [
+        (row, synthetic.joint_state(stamps[row], LINKS, *values[row])) for row in range(20)]},
+        storage)
+
+    series = read_bag(bag).joint_states('reference')
+
+    assert series.names == LINKS
+    assert np.array_equal(series.stamp_ns, stamps)
+    for index, array in enumerate((series.position, series.velocity, series.effort)):
+        assert np.array_equal(array, values[:, index])
+
+
+def test_what_a_message_leaves_out_is_nan(synthetic, tmp_path):
+    bag = synthetic.write_bag(tmp_path / 'bag', {'/link_angles': [
+        (1, synthetic.joint_state(1, ['link_b', 'link_d'], [2.0, 4.0])),
+        (2, synthetic.joint_state(2, [], [])),
+        (3, synthetic.joint_state(3, ['link_a', 'link_b'], [1.0]))]})
+
+    series = read_bag(bag).joint_states('link_angles').select(LINKS)
+
+    nan = np.nan
+    assert np.array_equal(
+        series.position, [[nan, 2.0, nan, 4.0], [nan] * 4, [nan] * 4], equal_nan=True)
+    assert np.all(np.isnan(series.velocity))
+
+
+def test_stamps_are_in_order_and_once_with_the_first_to_arrive(synthetic, tmp_path):
+    bag = synthetic.write_bag(tmp_path / 'bag', {'/reference': [
+        (received, synthetic.joint_state(stamp, ['link_a'], [received]))
+        for received, stamp in enumerate([30, 10, 20, 10, 30])]})
+    recording = read_bag(bag)
+
+    series = recording.joint_states('reference')
+
+    assert series.stamp_ns.tolist() == [10, 20, 30]
+    assert series.position[:, 0].tolist() == [1, 2, 0]
+    assert len(recording.arrivals('reference')) == 5
+
+
+@pytest.fixture
+def recording_of(synthetic, tmp_path):
+    """Return a function that makes a recording with one message on each of some topics."""
+    def make(*topics, namespace=None):
+        bag = synthetic.write_bag(tmp_path / 'bag', {
+            topic: [(0, synthetic.joint_state(0, [topic], [1.0]))] for topic in topics})
+        return read_bag(bag, namespace)
+    return make
+
+
+def test_namespace_is_found(recording_of):
+    recording = recording_of('/lab/reference', '/lab/sim/flywheel_states', '/lab/flywheel_states')
+    assert recording.joint_states('reference').topic == '/lab/reference'
+    assert recording.joint_states('flywheel_states').topic == '/lab/flywheel_states'
+    assert recording.joint_states('sim/flywheel_states').topic == '/lab/sim/flywheel_states'
+
+
+def test_ground_truth_never_stands_in_for_a_measurement(recording_of):
+    recording = recording_of('/sim/flywheel_states')
+    assert not recording.has('flywheel_states')
+
+
+def test_two_suites_need_a_namespace(recording_of):
+    recording = recording_of('/one/reference', '/two/reference')
+    for ask in (recording.has, recording.joint_states):
+        with pytest.raises(BagError, match='/one/reference or /two/reference'):
+            ask('reference')
+
+
+@pytest.mark.parametrize('namespace', ['/two', 'two', '/two/'])
+def test_namespace_chooses_a_suite(recording_of, namespace):
+    recording = recording_of('/one/reference', '/two/reference', namespace=namespace)
+    assert recording.joint_states('reference').topic == '/two/reference'
+
+
+def test_status_values(motion_bag):
+    recording = read_bag(motion_bag)
+    assert recording.statuses('device_status')[0].values['mechanism'] == 'paper'
+    with pytest.raises(BagError, match='DiagnosticStatus'):
+        recording.joint_states('device_status')
+
+
+def test_absent_and_empty_topics_are_told_apart(synthetic, tmp_path):
+    recording = read_bag(synthetic.write_bag(tmp_path / 'bag', {'/timing': []}))
+    assert not recording.has('timing')
+    with pytest.raises(BagError, match='no message on /timing'):
+        recording.joint_states('timing')
+    with pytest.raises(BagError, match='no topic energy'):
+        recording.joint_states('energy')
+
+
+def complaint_about(path):
+    with pytest.raises(FourbarError) as caught:
+        read_bag(path)
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    assert str(path) in message
+    return message
+
+
+def test_what_is_no_bag_is_said_to_be_none(tmp_path):
+    (tmp_path / 'file').touch()
+    assert 'no such directory' in complaint_about(tmp_path / 'nowhere')
+    assert 'is a file' in complaint_about(tmp_path / 'file')
+    assert 'not a rosbag2 directory' in complaint_about(tmp_path)
+
+
+def test_bag_of_a_killed_recorder_comes_with_the_repair(synthetic, tmp_path):
+    bag = synthetic.write_bag(tmp_path / 'bag', {'/timing': []})
+    (bag / 'metadata.yaml').unlink()
+    assert 'ros2 bag reindex -s mcap' in complaint_about(bag)
+
+
+def test_bag_cut_anywhere_is_refused(synthetic, tmp_path):
+    bag = synthetic.write_bag(tmp_path / 'bag', {'/reference': [
+        (row, synthetic.joint_state(row, LINKS, [1.0] * 4)) for row in range(5000)]})
+    file = next(bag.glob('*.mcap'))
+    content = file.read_bytes()
+    for share in (0.0, 0.01, 0.3, 0.6, 0.9, 0.999):
+        file.write_bytes(content[:int(share * len(content))])
+        assert 'cut' in complaint_about(bag)
+
+
+def test_missing_storage_file_is_one_line(synthetic, tmp_path):
+    bag = synthetic.write_bag(tmp_path / 'bag', {'/timing': []})
+    next(bag.glob('*.mcap')).unlink()
+    complaint_about(bag)
+
+
+@pytest.mark.parametrize('text', ['', 'nonsense: [', 'rosbag2_bagfile_information: {}'])
+def test_broken_metadata_is_one_line(synthetic, tmp_path, text):
+    bag = synthetic.write_bag(tmp_path / 'bag', {'/timing': []})
+    (bag / 'metadata.yaml').write_text(text)
+    complaint_about(bag)

@@ -1,0 +1,81 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""`fourbar report` as it is typed."""
+
+from importlib.util import module_from_spec, spec_from_file_location
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    path = Path(__file__).parents[1] / 'analysis' / 'synthetic.py'
+    spec = spec_from_file_location('synthetic', path)
+    synthetic = module_from_spec(spec)
+    spec.loader.exec_module(synthetic)
+    return synthetic.write_bag(tmp_path_factory.mktemp('bag') / 'run1',
+                               synthetic.motion_messages())
+
+
+def report(*arguments, cwd):
+    return subprocess.run(
+        [sys.executable, '-m', 'fourbar_ros', 'report', *map(str, arguments)], cwd=cwd,
+        capture_output=True, text=True, timeout=120)
+
+
+def test_files_are_beside_the_bag(bag):
+    done = report('run1', cwd=bag.parent)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert [Path(line).name for line in done.stdout.splitlines()] == [
+        'run1.report.html', 'run1.metrics.json']
+    assert (bag.parent / 'run1.report.html').read_text().startswith('<!DOCTYPE html>')
+    numbers = json.loads((bag.parent / 'run1.metrics.json').read_text())
+    assert numbers['missing'] == {}
+    assert not list(bag.glob('*.html'))
+
+
+def test_files_go_where_they_are_asked_to(bag, tmp_path):
+    done = report(bag, '-o', 'a.html', '--metrics', 'b.json', '--mechanism', 'paper', cwd=tmp_path)
+    assert done.returncode == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['a.html', 'b.json']
+
+
+@pytest.mark.parametrize(('arguments', 'complaint'), [
+    (['nowhere'], 'no such directory'),
+    (['.'], 'not a rosbag2 directory'),
+    (['{bag}', '--mechanism', 'nonsense'], 'nonsense'),
+    (['{bag}', '--namespace', '/lab'], 'no topic setpoint'),
+    (['{bag}', '-o', 'no/a.html'], 'cannot write'),
+])
+def test_bad_input_is_one_line_and_exit_code_2(bag, tmp_path, arguments, complaint):
+    done = report(*(argument.format(bag=bag) for argument in arguments), cwd=tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith('fourbar report: ')
+    assert complaint in done.stderr
+    assert done.stdout == ''
+
+
+def test_help_needs_no_heavy_library(tmp_path):
+    code = ('import sys; from fourbar_ros.commands import report; '
+            'import argparse; report.add_arguments(argparse.ArgumentParser()); '
+            'print(sorted({"matplotlib", "rosbags", "numpy", "rclpy"} & set(sys.modules)))')
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          cwd=tmp_path, check=True)
+    assert done.stdout == '[]\n'
