@@ -245,9 +245,8 @@ def errors(view: View) -> Figure:
         axes.plot(time, angle, color=LINK_COLOURS[link], linewidth=1.0,
                   label='estimate − ground truth')
         view.mark_step(axes)
-        axes.set_title(f'Estimate error of link {LETTERS[link]}', color=LINK_COLOURS[link],
-                       fontweight='bold')
-        axes.set_ylabel('error [deg]' if link % 2 == 0 else '')
+        axes.set_title(f'link {LETTERS[link]}', color=LINK_COLOURS[link], fontweight='bold')
+        axes.set_ylabel('estimate error [deg]' if link % 2 == 0 else '')
     style.legend_above(panels[1, 1])
     for axes in panels[-1]:
         axes.set_xlabel('time since setpoint [s]')
@@ -267,10 +266,9 @@ def _tracking_panels(view: View, actual: list[tuple[str, Paired]],
                       color=LINK_COLOURS[link] if best else COLOURS['muted'])
         axes.axhline(0.0, color=COLOURS['muted'], linewidth=0.7)
         view.mark_step(axes)
-        axes.set_title(f'Tracking error of link {LETTERS[link]}', color=LINK_COLOURS[link],
-                       fontweight='bold')
+        axes.set_title(f'link {LETTERS[link]}', color=LINK_COLOURS[link], fontweight='bold')
         axes.set_xlabel('time since setpoint [s]' if rows == 1 else '')
-    panels[0, 0].set_ylabel('error [deg]')
+    panels[0, 0].set_ylabel('tracking error [deg]')
     style.legend_above(panels[0, 1])
     return figure, panels
 
@@ -393,7 +391,11 @@ def timing(view: View) -> Figure:
         for share, look in ((50, '-'), (99, (0, (3, 2)))):
             axes.axhline(float(np.percentile(trips[known], share)), color=COLOURS['ink'],
                          linewidth=0.9, linestyle=look)
-    _name_levels(distribution, trips[known], period)
+    distribution.set_xlim(right=1.9 * distribution.get_xlim()[1])
+    for share, word in ((50, 'median'), (99, '99 %')):
+        value = float(np.percentile(trips[known], share))
+        _name_level(distribution, value, f'{word} {value:.2f} ms', 'ink')
+    _name_level(over_time, period, f'control period {period:.3g} ms', 'limit')
     over_time.set_title('From a tick to its command, at the device')
     over_time.set_ylabel('round trip [ms]')
     over_time.set_xlabel('time since setpoint [s]')
@@ -403,15 +405,10 @@ def timing(view: View) -> Figure:
     return figure
 
 
-def _name_levels(axes: Axes, trips: Floats, period: float) -> None:
-    p50, p99 = np.percentile(trips, [50, 99])
-    axes.set_xlim(right=1.9 * axes.get_xlim()[1])
-    for value, text, colour in ((p50, f'median {p50:.2f} ms', 'ink'),
-                                (p99, f'99 % {p99:.2f} ms', 'ink'),
-                                (period, f'period {period:.3g} ms', 'limit')):
-        axes.annotate(text, (1.0, value), xycoords=('axes fraction', 'data'), xytext=(0, 2),
-                      textcoords='offset points', ha='right', va='bottom', fontsize=8.0,
-                      color=COLOURS[colour])
+def _name_level(axes: Axes, value: float, text: str, colour: str) -> None:
+    axes.annotate(text, (1.0, value), xycoords=('axes fraction', 'data'), xytext=(-2, 2),
+                  textcoords='offset points', ha='right', va='bottom', fontsize=8.0,
+                  color=COLOURS[colour])
 
 
 def innovations(view: View) -> Figure:

@@ -61,7 +61,7 @@ SECTIONS = (
      'Time between a tick and the command that answers it, measured by the device on a steady '
      'clock. Solid line: median; dashed: 99th percentile; red: control period.'),
     ('innovations', 'Filter consistency',
-     'Innovations should scatter about zero without a trend. The black mean should stay in the '
+     'Innovations should scatter about zero without a trend. The mean should stay in the '
      'band: above it the filter trusts itself too much, below it too little.'),
 )
 

@@ -17,7 +17,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, ExitStack
+import fcntl
 from math import degrees, pi
 import os
 from pathlib import Path
@@ -80,19 +82,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the whole loop once."""
+    write_report, progress_bar = _analysis()
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     from fourbar_ros.configuration import share_directory
     os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE',
                           str(share_directory() / 'config' / 'fastdds_loopback.xml'))
-    write_report, progress_bar = _analysis()
     from fourbar_ros.nodes.environment import check_environment
     check_environment()
+    from fourbar_ros.loop.warm_up import main as compile_kernels
     from fourbar_ros.nodes.operator import Operator
 
-    with Operator() as testbed:
+    with Operator() as testbed, ExitStack() as stack:
         _refuse_second_plant(testbed)
+        stack.enter_context(_locked(args.output))
         _prepare(args.output)
-        _compile()
+        # Once here, or three nodes would do it side by side.
+        compile_kernels()
         with Processes(args.output / 'logs', os.environ) as processes:
             _move(testbed, processes, args.output / 'bag', progress_bar)
     print('Writing the report')
@@ -121,10 +126,26 @@ def _refuse_second_plant(testbed: Any) -> None:
                         'another ROS_DOMAIN_ID')
 
 
-def _prepare(output: Path) -> None:
-    """Make an empty output folder, leaving alone what is not the demo's."""
+@contextmanager
+def _locked(output: Path) -> Iterator[None]:
+    """Keep two demos on different domains out of one folder."""
     try:
         output.mkdir(parents=True, exist_ok=True)
+        folder = os.open(output, os.O_RDONLY)
+    except OSError as error:
+        raise OutputError(f'cannot write to {output}: {error.strerror}') from None
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError:
+        raise DemoError(f'another demo is writing to {output}') from None
+    finally:
+        os.close(folder)
+
+
+def _prepare(output: Path) -> None:
+    """Empty the output folder, leaving alone what is not the demo's."""
+    try:
         for name in ('bag', 'logs'):
             if (output / name).exists():
                 shutil.rmtree(output / name)
@@ -134,14 +155,6 @@ def _prepare(output: Path) -> None:
     except OSError as error:
         raise OutputError(
             f'cannot write to {error.filename or output}: {error.strerror}') from None
-
-
-def _compile() -> None:
-    """Compile once here, or three nodes would do it side by side."""
-    from fourbar_ros.loop.warm_up import is_cold, warm_up
-    if is_cold():
-        print('Compiling the kernels, once (about 10 s)', flush=True)
-    warm_up()
 
 
 def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> None:

@@ -41,3 +41,14 @@ def warm_up() -> None:
         Estimator(mechanism, EstimatorSettings()), Controller(mechanism, ControllerSettings()))
     for _ in range(3):
         loop.step()
+
+
+def main() -> None:
+    """Compile, and say so if it takes a while."""
+    if is_cold():
+        print('Compiling the kernels, once (about 10 s)', flush=True)
+    warm_up()
+
+
+if __name__ == '__main__':
+    main()

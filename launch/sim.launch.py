@@ -1,0 +1,90 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Simulated table, estimator and controller: `ros2 launch fourbar_ros sim.launch.py`.
+
+The numerical kernels are compiled first (some ten seconds, once), then the nodes start.
+"""
+
+from launch.actions import (
+    DeclareLaunchArgument,
+    ExecuteProcess,
+    OpaqueFunction,
+    RegisterEventHandler,
+)
+from launch.event_handlers import OnProcessExit
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from launch import LaunchDescription
+
+EXECUTABLES = ('plant', 'estimator', 'controller')
+
+# Arguments that set a parameter of the same name, the nodes that have it, and its type.
+PARAMETERS = {
+    'mechanism': (EXECUTABLES, str),
+    'table': (('plant',), str),
+    'rate': (('plant',), float),
+    'seed': (('plant',), int),
+    'setpoint_duration': (('controller',), float),
+}
+
+
+def generate_launch_description():
+    """Describe the arguments and what starts when."""
+    return LaunchDescription([
+        DeclareLaunchArgument(
+            'namespace', default_value='',
+            description='namespace of the three nodes, for instance lab'),
+        DeclareLaunchArgument(
+            'params_file', default_value='',
+            description='parameters file of all nodes; config/nodes.yaml is one to start from'),
+        DeclareLaunchArgument(
+            'mechanism', default_value='',
+            description='mechanism preset (paper) or path of a mechanism file; empty: as in '
+                        'params_file'),
+        DeclareLaunchArgument(
+            'table', default_value='',
+            description='table preset (ideal) or path of a table file; empty: as in params_file'),
+        DeclareLaunchArgument(
+            'rate', default_value='',
+            description='control rate [Hz], 250.0 unless given here or in params_file'),
+        DeclareLaunchArgument(
+            'seed', default_value='',
+            description='seed of all random numbers of the plant, 0 unless given'),
+        DeclareLaunchArgument(
+            'setpoint_duration', default_value='',
+            description='time in which a setpoint is reached [s], 10.0 unless given'),
+        OpaqueFunction(function=_start),
+    ])
+
+
+def _start(context):
+    def argument(name):
+        return LaunchConfiguration(name).perform(context)
+
+    nodes = []
+    for executable in EXECUTABLES:
+        given = {name: kind(argument(name)) for name, (owners, kind) in PARAMETERS.items()
+                 if executable in owners and argument(name)}
+        files = [argument('params_file')] if argument('params_file') else []
+        nodes.append(Node(
+            package='fourbar_ros', executable=executable, namespace=argument('namespace'),
+            parameters=[*files, *([given] if given else [])], output='screen'))
+    # In the Python of the nodes, which need not be that of ros2 launch.
+    compiling = ExecuteProcess(
+        cmd=['python3', '-m', 'fourbar_ros.loop.warm_up'], output='screen')
+    return [compiling, RegisterEventHandler(
+        OnProcessExit(target_action=compiling, on_exit=nodes))]
