@@ -26,7 +26,7 @@ with open(os.path.join(PACKAGE, '__init__.py'), encoding='utf-8') as stream:
     VERSION = re.search(r"^__version__ = '(.+)'$", stream.read(), re.MULTILINE).group(1)
 
 EXTRAS = {
-    'analysis': ['matplotlib', 'rosbags>=0.10', 'tqdm'],
+    'analysis': ['matplotlib>=3.7', 'rosbags>=0.10', 'tqdm'],
     'dev': [
         'colcon-core>=0.15',
         'colcon-library-path',

@@ -182,11 +182,12 @@ def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> N
     settled_ns = testbed.stamp_ns() + SETTLE_BEFORE * 1e9
     until(lambda: bool(testbed.stamp_ns() >= settled_ns), 'no ticks came')
     _demand(*testbed.arm(True))
-    until(lambda: testbed.statuses['controller_status']['mode'] == 'hold',
+    until(lambda: testbed.statuses['device_status']['state'] == 'armed', 'no word of the arming')
+    until(lambda: _armed(testbed) and testbed.statuses['controller_status']['mode'] == 'hold',
           'the controller did not notice the arming')
     goal = [angle + TURN for angle in testbed.positions('sim/link_states', LINKS)]
     accepted, reason = testbed.setpoint(LINKS, goal)
-    _demand(accepted, f'setpoint refused: {reason}')
+    _demand(accepted or not _armed(testbed), f'setpoint refused: {reason}')
 
     start_ns = testbed.stamp_ns()
     duration = float(testbed.statuses['controller_status']['setpoint_duration_s']) + SETTLE_AFTER
@@ -194,9 +195,7 @@ def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> N
     # disable=None: a bar only where stderr is a terminal.
     with progress_bar(total=duration, bar_format=PROGRESS, disable=None) as bar:
         def arrived() -> bool:
-            device = testbed.statuses['device_status']
-            _demand(device['state'] == 'armed', f'the device is {device["state"]}: '
-                                                f'{device["reason"]}')
+            _armed(testbed)
             elapsed = (testbed.stamp_ns() - start_ns) * 1e-9
             angle = degrees(testbed.positions('estimate/link_states', LINKS)[0])
             bar.set_postfix_str(f'link_a at {angle:.1f} deg', refresh=False)
@@ -206,6 +205,13 @@ def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> N
     testbed.arm(False)
     for name in ('controller', 'estimator', 'plant', 'record'):
         processes.stop(name)
+
+
+def _armed(testbed: Any) -> bool:
+    """Make sure that the device is still armed, or say why not."""
+    device = testbed.statuses['device_status']
+    _demand(device['state'] == 'armed', f'the device is {device["state"]}: {device["reason"]}')
+    return True
 
 
 def _demand(success: bool, message: str) -> None:

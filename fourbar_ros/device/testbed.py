@@ -98,7 +98,8 @@ class Testbed:
         self._wheel_speeds = np.zeros(4)
         self._link_seen_ns: list[int | None] = [None] * 4
         self._tick_ns: int | None = None
-        self._published_steady_ns = 0
+        # Ticks without an answer so far: when each went out, by stamp.
+        self._open_ticks: dict[int, int] = {}
         self._step_ns = 0
         self._command_stamp_ns: int | None = None
         self._command_steady_ns: int | None = None
@@ -112,7 +113,7 @@ class Testbed:
 
         :raises FourbarError: the device failed; the gate is in `fault`, and stays there.
         """
-        timing = self._close_period(steady_ns)
+        timing = self._timing(steady_ns)
         self._watch_commands(stamp_ns, steady_ns)
         try:
             samples = self.device.step(stamp_ns, self._driving_torques())
@@ -133,7 +134,8 @@ class Testbed:
 
         :param step_ns: time that the device needed for it [ns].
         """
-        self._published_steady_ns = steady_ns
+        if self._tick_ns is not None:
+            self._open_ticks[self._tick_ns] = steady_ns
         self._step_ns = step_ns
 
     def command(self, stamp_ns: int, names: Sequence[str], positions: Sequence[float],
@@ -156,8 +158,7 @@ class Testbed:
         self.clipped += bool((limited != torques).any())
         self._command_stamp_ns = stamp_ns
         self._command_steady_ns = steady_ns
-        if self._round_trip_ns is None and stamp_ns == self._tick_ns:
-            self._round_trip_ns = steady_ns - self._published_steady_ns
+        self._answered(stamp_ns, steady_ns)
         self._torques[:] = limited
 
     def arm(self, steady_ns: int, obstacles: Sequence[str]) -> tuple[bool, str]:
@@ -221,18 +222,26 @@ class Testbed:
         if self._command_stamp_ns is not None and stamp_ns < self._command_stamp_ns:
             raise CommandError('stale', 'stamp is older than that of the last command')
 
-    def _close_period(self, steady_ns: int) -> Timing:
-        """Judge how the last tick was answered."""
-        answered = self._round_trip_ns is not None
-        if not answered and self._command_stamp_ns is not None:
-            self._lost += 1
-        timing = Timing(
-            self._round_trip_ns * 1e-9 if self._round_trip_ns is not None else None,
+    def _answered(self, stamp_ns: int, steady_ns: int) -> None:
+        published_ns = self._open_ticks.pop(stamp_ns, None)
+        if published_ns is not None:
+            self._round_trip_ns = steady_ns - published_ns
+            self._lost += self._round_trip_ns > self.device.period_ns
+
+    def _timing(self, steady_ns: int) -> Timing:
+        """Report the last answer, and give up on ticks that waited for more than a period."""
+        overdue = [stamp_ns for stamp_ns, published_ns in self._open_ticks.items()
+                   if steady_ns - published_ns > self.device.period_ns]
+        for stamp_ns in overdue:
+            del self._open_ticks[stamp_ns]
+        if self._command_stamp_ns is not None:
+            self._lost += len(overdue)
+        round_trip_ns, self._round_trip_ns = self._round_trip_ns, None
+        return Timing(
+            round_trip_ns * 1e-9 if round_trip_ns is not None else None,
             (steady_ns - self._command_steady_ns) * 1e-9
             if self._command_steady_ns is not None else None,
             self._lost, self._step_ns * 1e-9)
-        self._round_trip_ns = None
-        return timing
 
     def _watch_commands(self, stamp_ns: int, steady_ns: int) -> None:
         if not self.gate.armed:

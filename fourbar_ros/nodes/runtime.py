@@ -15,6 +15,7 @@
 """How every node starts, runs and ends."""
 
 import argparse
+import gc
 import signal
 
 from fourbar_ros.nodes.environment import RosError
@@ -66,6 +67,10 @@ class Runtime:
 
     def spin(self):
         """Run callbacks until a signal or a failure; raises the failure."""
+        # What lives until the end need not be searched for garbage: with all that numba and
+        # matplotlib leave behind, one full search takes longer than several ticks.
+        gc.collect()
+        gc.freeze()
         while not self.stopping and self.failure is None:
             self.executor.spin_once(timeout_sec=SPIN_TIMEOUT)
         if self.failure is not None:

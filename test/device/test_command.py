@@ -1,0 +1,87 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A wheel command is taken whole or rejected whole."""
+
+from itertools import permutations
+from math import inf, nan
+
+from fourbar_ros.device import CommandError
+from fourbar_ros.device.command import torques_by_name
+from fourbar_ros.mechanism import FLYWHEEL_NAMES
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import pytest
+
+A, B, C, D = FLYWHEEL_NAMES
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+def rejected(names: list[str], efforts: list[float], **others: list[float]) -> CommandError:
+    with pytest.raises(CommandError) as caught:
+        torques_by_name(
+            names, others.get('positions', []), others.get('velocities', []), efforts)
+    return caught.value
+
+
+@pytest.mark.parametrize('order', list(permutations(range(4))))
+def test_names_may_come_in_any_order(order: tuple[int, ...]) -> None:
+    torques = torques_by_name(
+        [FLYWHEEL_NAMES[wheel] for wheel in order], [], [], [10.0 + wheel for wheel in order])
+    assert torques.tolist() == [10.0, 11.0, 12.0, 13.0]
+
+
+@settings(derandomize=True)
+@given(given_torques=st.dictionaries(st.sampled_from(FLYWHEEL_NAMES), finite, min_size=1))
+def test_wheel_that_is_not_named_gets_none(given_torques: dict[str, float]) -> None:
+    torques = torques_by_name(list(given_torques), [], [], list(given_torques.values()))
+    assert torques.tolist() == [given_torques.get(name, 0.0) for name in FLYWHEEL_NAMES]
+
+
+@pytest.mark.parametrize('name', ['flywheel_e', 'link_a', '', 'Flywheel_a'])
+def test_unknown_wheel_is_named(name: str) -> None:
+    error = rejected([A, name], [1.0, 1.0])
+    assert error.kind == 'names'
+    assert repr(name) in str(error)
+
+
+@pytest.mark.parametrize('names', [[A, A], [A, B, C, B]])
+def test_repeated_wheel_is_named(names: list[str]) -> None:
+    error = rejected(names, [1.0] * len(names))
+    assert error.kind == 'names'
+    assert f'{names[-1]} is named twice' in str(error)
+
+
+@pytest.mark.parametrize(('names', 'efforts'), [
+    ([], []), ([], [1.0]), ([A], []), ([A, B], [1.0]), ([A], [1.0, 2.0])])
+def test_lengths_must_agree(names: list[str], efforts: list[float]) -> None:
+    error = rejected(names, efforts)
+    assert error.kind == 'length'
+    assert f'{len(names)} names but {len(efforts)} efforts' in str(error)
+
+
+@pytest.mark.parametrize('value', [nan, inf, -inf])
+@pytest.mark.parametrize('wheel', FLYWHEEL_NAMES)
+def test_effort_must_be_finite(wheel: str, value: float) -> None:
+    error = rejected(list(FLYWHEEL_NAMES), [value if name == wheel else 0.0
+                                            for name in FLYWHEEL_NAMES])
+    assert error.kind == 'finite'
+    assert wheel in str(error)
+    assert str(value) in str(error)
+
+
+@pytest.mark.parametrize('field', ['positions', 'velocities'])
+def test_only_effort_is_taken(field: str) -> None:
+    assert rejected([A], [1.0], **{field: [0.0]}).kind == 'fields'
+    assert rejected([A], [], **{field: [0.0]}).kind == 'fields'

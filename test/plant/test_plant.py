@@ -1,0 +1,326 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the simulated table owes to physics, to its motors' limits and to its sensors."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import inf, nan, pi
+
+from fourbar_ros.mechanism import (
+    angular_momentum,
+    closure_error,
+    ClosureError,
+    kinetic_energy,
+    Mechanism,
+)
+from fourbar_ros.plant import InitialState, Plant, PlantError, Table, Truth
+from fourbar_ros.plant.table import LinkSensors, WheelEncoders
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+from scipy import stats
+
+Array = NDArray[np.float64]
+MakePlant = Callable[..., Plant]
+
+STEP = 5e-4
+# 4000 steps (2 s), some ten roundings of 1.1e-16 each, all to the same side: 4.4e-12. The
+# truncation of a step, (3 rad/s * 5e-4 s)^5 / 120 = 6e-17, is less than one rounding.
+LONG = 4000
+DRIFT = 1e-11
+# Two-sided confidence of every statistical bound below.
+CONFIDENCE = 0.999
+MOVING = InitialState(0.3, 1.6, 'open', 2.0, -1.0)
+TORQUES = np.array([3e-5, -2e-5, 4e-5, 1e-5])
+
+
+def absolute_speeds(truth: Truth) -> Array:
+    return truth.wheel_speeds + truth.link_rates
+
+
+def momentum(plant: Plant) -> float:
+    truth = plant.truth()
+    return angular_momentum(
+        plant.mechanism, truth.link_angles, truth.link_rates, absolute_speeds(truth))
+
+
+def energy(plant: Plant) -> float:
+    truth = plant.truth()
+    return kinetic_energy(
+        plant.mechanism, truth.link_angles, truth.link_rates, absolute_speeds(truth))
+
+
+@pytest.fixture(params=['paper', 'uneven'])
+def mechanism(request: pytest.FixtureRequest) -> Mechanism:
+    """Take the paper's linkage, then one without any symmetry."""
+    linkage: Mechanism = request.getfixturevalue(request.param)
+    return linkage
+
+
+@pytest.mark.parametrize('branch', ['open', 'crossed'])
+def test_without_torque_momentum_and_energy_stay(
+    mechanism: Mechanism, branch: str, make_plant: MakePlant,
+) -> None:
+    plant = make_plant(mechanism, initial=replace(MOVING, branch=branch))
+    before = momentum(plant), energy(plant)
+    plant.advance(LONG, np.zeros(4))
+    assert (momentum(plant), energy(plant)) == pytest.approx(before, rel=DRIFT)
+    assert closure_error(mechanism, plant.truth().link_angles) < 1e-15
+
+
+def test_torques_only_move_momentum_between_wheels_and_links(
+    mechanism: Mechanism, make_plant: MakePlant,
+) -> None:
+    plant = make_plant(mechanism)
+    for torques in (TORQUES, -2.0 * TORQUES, TORQUES[::-1]):
+        plant.advance(400, torques)
+    truth = plant.truth()
+    moved = float(mechanism.flywheel_inertias @ np.abs(absolute_speeds(truth)))
+    assert moved > 1e-6
+    assert abs(momentum(plant)) < DRIFT * moved
+
+
+def test_work_of_the_motors_becomes_energy(mechanism: Mechanism, make_plant: MakePlant) -> None:
+    plant = make_plant(mechanism)
+    # Simpson's rule over the power tau Omega, constant torques: its error is (h w)^4 / 180 of the
+    # total, with h w < 0.04 for the few rad/s and rad/s^2 of this motion.
+    samples = 101
+    power = np.empty(samples)
+    for n in range(samples):
+        power[n] = TORQUES @ plant.truth().wheel_speeds
+        if n < samples - 1:
+            plant.advance(10, TORQUES)
+    weights = np.where(np.arange(samples) % 2, 4.0, 2.0)
+    weights[[0, -1]] = 1.0
+    work = 10 * STEP / 3.0 * float(weights @ power)
+    assert energy(plant) == pytest.approx(work, rel=0.04 ** 4 / 180.0 + DRIFT)
+
+
+def test_motor_limits_do_not_touch_momentum(mechanism: Mechanism, make_plant: MakePlant) -> None:
+    weak = replace(mechanism, motor_torque_limits=np.full(4, 2e-5),
+                   motor_speed_limits=np.array([4.0, 2.0, 6.0, 500.0]))
+    plant = make_plant(weak)
+    plant.advance(1000, np.array([1.0, -1.0, 1e-5, 1e-3]))
+    truth = plant.truth()
+    assert (np.abs(truth.wheel_speeds[:2]) > [3.9, 1.9]).all()
+    moved = float(weak.flywheel_inertias @ np.abs(absolute_speeds(truth)))
+    assert abs(momentum(plant)) < DRIFT * moved
+
+
+def test_efforts_are_what_changed_the_wheels(mechanism: Mechanism, make_plant: MakePlant) -> None:
+    """Under every kind of command, the mean torque times the time is the change of momentum."""
+    limited = replace(mechanism, motor_speed_limits=np.array([3.0, 3.0, 500.0, 500.0]))
+    plant = make_plant(limited)
+    rng = np.random.default_rng(1)
+    speeds = absolute_speeds(plant.truth())
+    for _ in range(50):
+        commands = rng.uniform(-3e-4, 3e-4, 4)
+        plant.advance(8, commands)
+        truth = plant.truth()
+        gained = limited.flywheel_inertias * (absolute_speeds(truth) - speeds)
+        # Eight roundings of a wheel's momentum, at most a hundred rad/s.
+        np.testing.assert_allclose(
+            truth.efforts * 8 * STEP, gained, rtol=0.0, atol=8 * 2.2e-16 * 100 * 5e-7 * 10)
+        assert (np.abs(truth.efforts) <= limited.motor_torque_limits * (1 + 1e-15)).all()
+        speeds = absolute_speeds(truth)
+
+
+def test_torque_beyond_the_limit_acts_as_the_limit(
+    paper: Mechanism, make_plant: MakePlant,
+) -> None:
+    plant, same = make_plant(), make_plant()
+    plant.advance(8, np.array([1.0, -1.0, 0.0, 2e-4]))
+    same.advance(8, np.array([1e-4, -1e-4, 0.0, 1e-4]))
+    assert plant.truth().efforts == pytest.approx([1e-4, -1e-4, 0.0, 1e-4], rel=1e-14)
+    assert plant.truth().link_angles.tobytes() == same.truth().link_angles.tobytes()
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_speed_limit_blocks_torque_only_into_the_stop(
+    sign: float, paper: Mechanism, make_plant: MakePlant,
+) -> None:
+    limit = 20.0
+    plant = make_plant(replace(paper, motor_speed_limits=np.full(4, limit)))
+    drive = sign * np.array([1e-4, 0.0, 0.0, 0.0])
+    # 1e-4 N m / 3.4e-7 kg m^2 reaches 20 rad/s in 68 ms.
+    plant.advance(200, drive)
+    speed = sign * plant.truth().wheel_speeds[0]
+    # One step may pass the limit, by what it adds (the link recoils by less than 1 % of it).
+    assert limit <= speed <= limit + 1.01 * 1e-4 / 3.4e-7 * STEP
+    plant.advance(8, drive)
+    assert plant.truth().efforts[0] == 0.0
+    plant.advance(8, -drive)
+    assert plant.truth().efforts[0] == pytest.approx(-drive[0], rel=1e-14)
+    assert sign * plant.truth().wheel_speeds[0] < limit
+    plant.advance(1, drive)
+    assert plant.truth().efforts[0] == drive[0]
+
+
+def test_wheels_start_at_rest_on_moving_links(mechanism: Mechanism, make_plant: MakePlant) -> None:
+    truth = make_plant(mechanism, initial=MOVING).truth()
+    assert truth.link_rates[:2].tolist() == [MOVING.rate_a, MOVING.rate_b]
+    assert not truth.wheel_speeds.any()
+    assert not truth.wheel_angles.any()
+    assert not truth.efforts.any()
+
+
+def test_truth_is_a_copy(make_plant: MakePlant) -> None:
+    plant = make_plant()
+    truth = plant.truth()
+    for name in ('link_angles', 'link_rates', 'wheel_angles', 'wheel_speeds', 'efforts'):
+        getattr(truth, name)[:] = 9.0
+    assert 9.0 not in plant.truth().link_angles
+    plant.advance(1, np.zeros(4))
+    assert not plant.truth().efforts.any()
+
+
+def sensed(plant: Plant, count: int) -> Array:
+    """Return the errors (count, 4) of the link sensors at rest."""
+    truth = plant.truth().link_angles
+    errors = np.array([plant.sense_links() for _ in range(count)]) - truth
+    return (errors + pi) % (2.0 * pi) - pi
+
+
+@pytest.fixture(scope='module')
+def noise(make_plant: MakePlant) -> Array:
+    """Sample the noise (4000, 4) of the link sensors, in units of its rms; seed 3."""
+    rms = 2e-3
+    table = Table(LinkSensors(rms, 0), WheelEncoders(0))
+    return sensed(make_plant(table=table, seed=3), 4000) / rms
+
+
+def test_noise_has_the_rms_asked_for(noise: Array) -> None:
+    for errors in noise.T:
+        low, high = stats.chi2.interval(CONFIDENCE, errors.size)
+        assert low < float(errors @ errors) < high
+        assert abs(errors.mean()) * np.sqrt(errors.size) < stats.norm.interval(CONFIDENCE)[1]
+
+
+def test_noise_is_white_and_each_sensor_has_its_own(noise: Array) -> None:
+    """No correlation in time up to 20 samples, and none between two sensors."""
+    bound = stats.norm.interval(1.0 - (1.0 - CONFIDENCE) / (16 * 20 + 6))[1]
+    for lag in range(21):
+        later, earlier = noise[lag:], noise[:len(noise) - lag]
+        correlations = later.T @ earlier / np.sqrt(len(later))
+        if lag == 0:
+            correlations = correlations[np.triu_indices(4, 1)]
+        assert np.abs(correlations).max() < bound, f'lag {lag}'
+
+
+@pytest.mark.parametrize('counts', [4, 1000, 16384])
+def test_samples_sit_on_the_grid_of_the_resolution(counts: int, make_plant: MakePlant) -> None:
+    step = 2.0 * pi / counts
+    plant = make_plant(table=Table(LinkSensors(0.0, counts), WheelEncoders(counts)),
+                       initial=InitialState(0.7, 2.0, 'open', 1.0, 0.3))
+    plant.advance(321, TORQUES)
+    truth = plant.truth()
+    wrapped = np.angle(np.exp(1j * (plant.sense_links() - truth.link_angles)))
+    for samples, errors in ((plant.sense_links(), wrapped),
+                            (plant.sense_wheels(), plant.sense_wheels() - truth.wheel_angles)):
+        np.testing.assert_allclose(samples / step, np.round(samples / step), atol=1e-9)
+        assert (np.abs(errors) <= step / 2.0 * (1 + 1e-9)).all()
+
+
+@pytest.mark.parametrize('counts', [0, 16384])
+@pytest.mark.parametrize('link_a', [pi, -pi, 5.0 * pi])
+def test_samples_lie_in_one_turn(link_a: float, counts: int, make_plant: MakePlant) -> None:
+    """On the cut itself noise falls to either side, but never outside (-pi, pi]."""
+    plant = make_plant(table=Table(LinkSensors(1e-3, counts), WheelEncoders(0)),
+                       initial=InitialState(link_a, link_a + 1.0))
+    samples = np.array([plant.sense_links() for _ in range(400)])
+    assert ((samples > -pi) & (samples <= pi)).all()
+    assert (samples[:, 0] > 3.0).any()
+    assert (samples[:, 0] < -3.0).any()
+
+
+def test_wheel_encoders_count_turns(make_plant: MakePlant) -> None:
+    plant = make_plant()
+    plant.advance(4000, np.array([2e-5, 0.0, 0.0, 0.0]))
+    assert plant.sense_wheels()[0] > 4.0 * pi
+    assert plant.sense_wheels().tolist() == plant.truth().wheel_angles.tolist()
+
+
+def record(plant: Plant) -> bytes:
+    samples = []
+    for _ in range(20):
+        plant.advance(8, TORQUES)
+        samples += [plant.sense_links(), plant.sense_wheels(), plant.truth().link_rates]
+    return np.array(samples).tobytes()
+
+
+def test_same_seed_same_bytes(make_plant: MakePlant) -> None:
+    table = Table(LinkSensors(1e-3, 16384), WheelEncoders(16384))
+    assert record(make_plant(table=table, seed=7)) == record(make_plant(table=table, seed=7))
+    assert record(make_plant(table=table, seed=7)) != record(make_plant(table=table, seed=8))
+
+
+@settings(deadline=None, max_examples=200, derandomize=True)
+@given(count=st.integers(1, 100_000), step=st.floats(1e-6, 0.1))
+def test_whole_multiples_are_counted(count: int, step: float, make_plant: MakePlant) -> None:
+    plant = make_plant()
+    plant.step_s = step
+    assert plant.steps_in(count * step) == count
+
+
+@pytest.mark.parametrize(('period', 'ratio'), [(0.0041, '8.2'), (1e-4, '0.2'), (1e-9, '2e-06')])
+def test_period_that_is_no_multiple_is_refused(
+    period: float, ratio: str, make_plant: MakePlant,
+) -> None:
+    with pytest.raises(PlantError, match=f'whole multiple.* = {ratio}'):
+        make_plant().steps_in(period)
+
+
+@pytest.mark.parametrize('step', [0.0, -1e-3, nan, inf])
+def test_step_that_is_no_positive_number_is_refused(step: float, make_plant: MakePlant) -> None:
+    with pytest.raises(PlantError, match=f'positive number of seconds, got {step}'):
+        make_plant(step_s=step)
+
+
+@pytest.mark.parametrize('name', ['link_a', 'link_b', 'rate_a', 'rate_b'])
+@pytest.mark.parametrize('value', [nan, inf, -inf])
+def test_initial_state_must_be_finite(name: str, value: float, make_plant: MakePlant) -> None:
+    with pytest.raises(PlantError, match=f'initial {name} must be finite, got {value}'):
+        make_plant(initial=replace(InitialState(), **{name: value}))
+
+
+@pytest.mark.parametrize('theta', [0.0, pi])
+def test_rates_at_a_change_point_are_refused(
+    theta: float, paper: Mechanism, make_plant: MakePlant,
+) -> None:
+    """At rest it is a place to start from; moving, two rates do not determine the other two."""
+    rectangle = replace(paper, link_lengths=np.array([0.1, 0.05, 0.1, 0.05]))
+    make_plant(rectangle, initial=InitialState(0.2, 0.2 + theta))
+    with pytest.raises(PlantError, match='change point'):
+        make_plant(rectangle, initial=InitialState(0.2, 0.2 + theta, rate_b=0.1))
+
+
+def test_initial_angles_that_cannot_close_are_refused(
+    uneven: Mechanism, make_plant: MakePlant,
+) -> None:
+    long = replace(uneven, link_lengths=np.array([0.3, 0.3, 0.2, 0.2]))
+    with pytest.raises(ClosureError, match='link_b = 3'):
+        make_plant(long, initial=InitialState(0.0, 3.0))
+    with pytest.raises(ClosureError, match='folded'):
+        make_plant(initial=InitialState(branch='folded'))
+
+
+def test_state_out_of_the_finite_numbers_is_an_error(
+    paper: Mechanism, make_plant: MakePlant,
+) -> None:
+    plant = make_plant(replace(paper, motor_torque_limits=np.full(4, inf)))
+    with pytest.raises(PlantError, match='no longer finite'):
+        plant.advance(10, np.full(4, 1e300))

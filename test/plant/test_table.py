@@ -1,0 +1,126 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A table file is taken as it stands or refused, with the name of what is wrong."""
+
+from collections.abc import Callable
+from copy import deepcopy
+from math import pi
+from pathlib import Path
+from typing import Any
+
+from fourbar_ros.configuration import ConfigurationError, presets
+from fourbar_ros.plant import load_table, Table, TableError
+from fourbar_ros.plant.table import LinkSensors, quantum, WheelEncoders
+import pytest
+import yaml
+
+GOOD = {
+    'link_sensors': {'noise_rms': 1e-3, 'counts_per_turn': 4096},
+    'wheel_encoders': {'counts_per_turn': 0},
+}
+PLACES = [(section, key) for section, keys in GOOD.items() for key in keys]
+each_value = pytest.mark.parametrize(('section', 'key'), PLACES)
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Callable[[Any], str]:
+    """Write a table file and return its path."""
+    def write(content: Any) -> str:
+        path = tmp_path / 'table.yaml'
+        path.write_text(yaml.safe_dump(content))
+        return str(path)
+    return write
+
+
+def with_value(section: str, key: str, value: Any) -> dict[str, Any]:
+    content: dict[str, Any] = deepcopy(GOOD)
+    content[section][key] = value
+    return content
+
+
+def test_values_arrive(written: Callable[[Any], str]) -> None:
+    assert load_table(written(GOOD)) == Table(LinkSensors(1e-3, 4096), WheelEncoders(0))
+
+
+def test_every_preset_loads() -> None:
+    names = presets('table')
+    assert 'ideal' in names
+    for name in names:
+        assert isinstance(load_table(name), Table)
+
+
+def test_ideal_table_has_the_sensors_of_the_design() -> None:
+    table = load_table('ideal')
+    assert table.link_sensors.noise_rms == pytest.approx(0.1 * pi / 180.0, rel=1e-4)
+    assert table.link_sensors.counts_per_turn == table.wheel_encoders.counts_per_turn == 2 ** 14
+
+
+@each_value
+@pytest.mark.parametrize('value', [-1, float('nan'), float('inf'), '1', True, None, [1], {}])
+def test_bad_value_is_refused_by_name(
+    section: str, key: str, value: Any, written: Callable[[Any], str],
+) -> None:
+    path = written(with_value(section, key, value))
+    with pytest.raises(TableError, match=rf'{section}\.{key} must') as caught:
+        load_table(path)
+    assert path in str(caught.value)
+
+
+@pytest.mark.parametrize('section', list(GOOD))
+def test_half_a_count_is_refused(section: str, written: Callable[[Any], str]) -> None:
+    with pytest.raises(TableError, match=rf'{section}\.counts_per_turn must be a whole number'):
+        load_table(written(with_value(section, 'counts_per_turn', 16.5)))
+
+
+@each_value
+def test_missing_key_is_named(section: str, key: str, written: Callable[[Any], str]) -> None:
+    content = deepcopy(GOOD)
+    del content[section][key]
+    with pytest.raises(TableError, match=rf'{section}: {key} missing'):
+        load_table(written(content))
+
+
+@pytest.mark.parametrize('section', list(GOOD))
+def test_missing_section_is_named(section: str, written: Callable[[Any], str]) -> None:
+    content = {name: keys for name, keys in GOOD.items() if name != section}
+    with pytest.raises(TableError, match=f'{section} missing'):
+        load_table(written(content))
+
+
+@pytest.mark.parametrize('section', list(GOOD))
+def test_section_that_is_none_is_refused(section: str, written: Callable[[Any], str]) -> None:
+    with pytest.raises(TableError, match=f'{section} must be a section'):
+        load_table(written({**GOOD, section: 3}))
+
+
+def test_unknown_section_is_named(written: Callable[[Any], str]) -> None:
+    with pytest.raises(TableError, match='unknown joint_friktion'):
+        load_table(written({**GOOD, 'joint_friktion': {}}))
+
+
+@pytest.mark.parametrize('section', list(GOOD))
+def test_unknown_key_is_named(section: str, written: Callable[[Any], str]) -> None:
+    with pytest.raises(TableError, match=f'{section}: unknown nois_rms'):
+        load_table(written(with_value(section, 'nois_rms', 1)))
+
+
+def test_missing_file_is_named() -> None:
+    with pytest.raises(ConfigurationError, match='no_such_table'):
+        load_table('no_such_table')
+
+
+def test_resolution_is_a_full_turn() -> None:
+    assert quantum(0) == 0.0
+    assert quantum(16384) * 16384 == pytest.approx(2.0 * pi, rel=1e-15)
