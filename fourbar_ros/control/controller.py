@@ -24,12 +24,15 @@ from fourbar_ros.control.allocation import minimum_norm
 from fourbar_ros.control.reference import SoftStep
 from fourbar_ros.control.setpoint import check_move, check_names, resolve, SetpointError
 from fourbar_ros.mechanism import Mechanism, nearest_assembly
-from fourbar_ros.mechanism.dynamics import gamma_matrix, NEAR_ALIGNMENT, reduced_form
+from fourbar_ros.mechanism.dynamics import gamma_matrix, reduced_form
 from fourbar_ros.mechanism.parameters import Array
 import numpy as np
 
 # A setpoint with a stamp (not zero, which means now) may be this far from the last tick [s].
 SETPOINT_TIMEOUT = 1.0
+
+# Closer to a change point than this |sin(phi_d - phi_c)| the wheels get no torque.
+NO_HOLD = 0.05
 
 # A longer silence than this between two ticks does not count as motion [s].
 LONGEST_PERIOD = 0.1
@@ -203,8 +206,8 @@ class Controller:
 
     def _torques(self, link_angles: Array, link_rates: Array, angle_errors: Array,
                  rate_errors: Array) -> Array:
-        if abs(sin(link_angles[3] - link_angles[2])) < NEAR_ALIGNMENT:
-            # Too close to a change point for the reduced form: the wheels coast through it.
+        if abs(sin(link_angles[3] - link_angles[2])) < NO_HOLD:
+            # Too close to a change point for the reduced form: coast through it.
             return np.zeros(4)
         stiffness = self.settings.bandwidth ** 2
         damping = 2.0 * self.settings.damping * self.settings.bandwidth

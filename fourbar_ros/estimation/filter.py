@@ -33,12 +33,14 @@ from fourbar_ros.mechanism.compiled import kernel
 from fourbar_ros.mechanism.dynamics import (
     gamma_matrix,
     mass_matrix,
-    NEAR_ALIGNMENT,
     project_onto_closure,
 )
 from fourbar_ros.mechanism.motion import advance_state, LINK_ANGLES, LINK_RATES, STATE_SIZE
 from fourbar_ros.mechanism.parameters import Array, Constants
 import numpy as np
+
+# Below this |sin(phi_d - phi_c)| the last good Gamma is kept: it divides by that sine.
+GAMMA_IS_LOST = 0.05
 
 # Half width of the central differences for the transition matrix [rad], [rad/s].
 DIFFERENCE = 1e-6
@@ -129,7 +131,7 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         return self.y, float(self.y @ self.SI @ self.y)
 
     def _refresh_gamma(self) -> None:
-        if abs(np.sin(self.angles[3] - self.angles[2])) > NEAR_ALIGNMENT:
+        if abs(np.sin(self.angles[3] - self.angles[2])) > GAMMA_IS_LOST:
             self.gamma = gamma_matrix(self.angles, self._constants.lengths)
 
 

@@ -31,7 +31,7 @@ from typing import Any
 
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism.closure import closure_error
-from fourbar_ros.mechanism.dynamics import closure_derivatives
+from fourbar_ros.mechanism.dynamics import closure_jacobian
 from fourbar_ros.mechanism.motion import (
     LINK_ANGLES,
     LINK_RATES,
@@ -168,8 +168,7 @@ def _check_closure(case: Case) -> None:
     if gap > limit:
         raise CaseError(
             f'initial link_angles do not close the loop: gap {gap:.3g} m, limit {limit:.3g} m')
-    jacobian, _ = closure_derivatives(
-        case.link_angles, case.link_rates, case.mechanism.constants.lengths)
+    jacobian = closure_jacobian(case.link_angles, case.mechanism.constants.lengths)
     slip = float(np.hypot(*(jacobian @ case.link_rates)))
     if slip > limit:
         raise CaseError(

@@ -23,7 +23,7 @@ where c and d fold onto a line (a change point).
 
 from __future__ import annotations
 
-from math import acos, atan2, cos, hypot, pi, sin
+from math import acos, atan2, cos, hypot, isfinite, pi, sin
 
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism.angles import wrap
@@ -122,6 +122,8 @@ def solve_pair(
     i, j = known
     k, m = (index for index in range(4) if index not in known)
     lengths = mechanism.link_lengths
+    if not all(map(isfinite, angles)):
+        raise ClosureError(f'link angles must be finite, got {angles[0]} and {angles[1]}')
     names = f'{LINK_NAMES[i]} = {angles[0]:.4f} rad and {LINK_NAMES[j]} = {angles[1]:.4f} rad'
     # s_k l_k e_k + s_m l_m e_m = gap: a triangle with sides l_k, l_m and the gap.
     gap_x = -sum(SIGNS[n] * lengths[n] * cos(angle) for n, angle in zip(known, angles))
@@ -146,6 +148,6 @@ def solve_pair(
         solution = np.empty(4)
         solution[[i, j]] = angles
         solution[k] = wrap(phi_k)
-        solution[m] = atan2(rest_y, rest_x)
+        solution[m] = wrap(atan2(rest_y, rest_x))
         solutions.append(solution)
     return solutions

@@ -37,14 +37,22 @@ from fourbar_ros.mechanism.parameters import Array, Constants, Mechanism
 import numpy as np
 from numpy.typing import ArrayLike
 
-# Below this |sin(phi_d - phi_c)| the constraint forces come from the pseudo-inverse: the reduced
-# form loses about 1 / |sin|^2 in accuracy.
-NEAR_ALIGNMENT = 0.05
+# Below this |sin(phi_d - phi_c)| the constrained form is solved. The reduced form loses about
+# 1 / |sin|^2 in accuracy, and the stages of an integration step, which are a little off the
+# closure, about as much again.
+NEAR_ALIGNMENT = 0.3
 
-# Singular-value ratios below which a constraint direction counts as lost. The forces need it
-# nearly up to the exact hit; the projection onto the closure must not amplify rounding by it.
-LOST_FOR_FORCES = 1e-9
-LOST_FOR_PROJECTION = 1e-3
+# Ratio of the singular values of the constraints below which the weaker direction is at a change
+# point: there it follows from the third derivative of the closure, and closure errors are left
+# alone, since removing them divides the rounding of an angle by this ratio. Lengths that differ
+# by less than its square (1e-8 of the length) count as equal.
+AT_CHANGE_POINT = 1e-4
+
+# The third derivative needs motion. It is weighted by the time [s] that the motion takes through
+# the neighbourhood of the change point, but at most by this; so that a linkage at rest, all but
+# rounding, is free to leave on either branch: below this ratio nothing constrains it.
+LONGEST_PASSAGE = 1.0
+LOST = 1e-9
 
 
 class ChangePointError(FourbarError):
@@ -288,53 +296,68 @@ def _constrained_accelerations(angles: Array, rates: Array, forces: Array,
     for j in range(4):
         out[j] = forces[j] - bias[j]
     solve_cholesky(factor, out)
-    jacobian, centripetal = closure_derivatives(angles, rates, constants.lengths)
-    need_x, need_y = centripetal
+    # A turn of the whole changes no derivative of the closure.
+    turn = 0.25 * (rates[0] + rates[1] + rates[2] + rates[3])
+    jacobian = closure_jacobian(angles, constants.lengths)
+    jerk = np.empty((2, 4))
+    need_x = need_y = jerk_x = jerk_y = 0.0
     for j in range(4):
-        need_x -= jacobian[0, j] * out[j]
-        need_y -= jacobian[1, j] * out[j]
-    correct_along_constraints(factor, jacobian, need_x, need_y, LOST_FOR_FORCES, out)
+        rate = rates[j] - turn
+        # s_j l_j e_j, and J alpha = sum of it times rate^2.
+        x, y = jacobian[1, j], -jacobian[0, j]
+        need_x += x * rate * rate - jacobian[0, j] * out[j]
+        need_y += y * rate * rate - jacobian[1, j] * out[j]
+        # J d(alpha)/dt - 3 sum s l e rate alpha - sum s l E e rate^3 = 0
+        jerk[0, j] = -3.0 * x * rate
+        jerk[1, j] = -3.0 * y * rate
+        jerk_x += -y * rate * rate * rate - jerk[0, j] * out[j]
+        jerk_y += x * rate * rate * rate - jerk[1, j] * out[j]
+    strong, weak, c, s = orthogonal_columns(factor, jacobian)
+    size = float(strong @ strong)
+    need_strong = c * need_x + s * need_y
+    need_weak = c * need_y - s * need_x
+    if weak @ weak < AT_CHANGE_POINT * AT_CHANGE_POINT * size:
+        third = solve_lower(factor, c * jerk[1] - s * jerk[0])
+        along = float(third @ strong) / size
+        third -= along * strong
+        need_third = c * jerk_y - s * jerk_x - along * need_strong
+        length = sqrt(float(third @ third))
+        if length > 0.0:
+            time = min(LONGEST_PASSAGE, AT_CHANGE_POINT * sqrt(size) / length)
+            # Ahead of the change point the two would cancel without this sign.
+            if third @ weak < 0.0:
+                time = -time
+            weak += time * third
+            need_weak += time * need_third
+    correction = need_strong / size * strong
+    if weak @ weak > LOST * LOST * size:
+        correction += need_weak / (weak @ weak) * weak
+    add_upper_solution(factor, correction, out)
 
 
 @kernel
-def closure_derivatives(angles: Array, rates: Array, lengths: Array
-                        ) -> tuple[Array, tuple[float, float]]:
-    """Evaluate the closure's Jacobian J (2, 4) [m] and -dJ/dt omega [m/s^2]."""
+def closure_jacobian(angles: Array, lengths: Array) -> Array:
+    """Evaluate the Jacobian J (2, 4) of the closure [m]."""
     jacobian = np.empty((2, 4))
-    x = y = 0.0
     for j in range(4):
         arm = -lengths[j] if (j == 0 or j == 3) else lengths[j]
-        s, c = sin(angles[j]), cos(angles[j])
-        jacobian[0, j] = -arm * s
-        jacobian[1, j] = arm * c
-        x += arm * c * rates[j] * rates[j]
-        y += arm * s * rates[j] * rates[j]
-    return jacobian, (x, y)
+        jacobian[0, j] = -arm * sin(angles[j])
+        jacobian[1, j] = arm * cos(angles[j])
+    return jacobian
 
 
 @kernel
-def correct_along_constraints(factor: Array, jacobian: Array, need_x: float, need_y: float,
-                              lost: float, vector: Array) -> None:
+def orthogonal_columns(factor: Array, jacobian: Array) -> tuple[Array, Array, float, float]:
     """
-    Add to `vector` the M^-1 J^T lambda that changes `J vector` by the need, where that exists.
+    Turn the columns of `L^-1 J^T` into orthogonal ones, the larger one first.
 
-    With `M = L L^T` the columns of `B = L^-1 J^T` are turned into orthogonal ones by one Jacobi
-    rotation, so that a small singular value is known to full precision; directions whose
-    singular value is below `lost` times the larger one get no force.
+    One Jacobi rotation, so that a small singular value is known to full precision.
+
+    :returns: the columns (4,), and cosine and sine of the rotation.
     """
-    b = np.empty((4, 2))
-    for i in range(4):
-        for axis in range(2):
-            value = jacobian[axis, i]
-            for k in range(i):
-                value -= factor[i, k] * b[k, axis]
-            b[i, axis] = value / factor[i, i]
-    p = q = r = 0.0
-    for i in range(4):
-        p += b[i, 0] * b[i, 0]
-        q += b[i, 0] * b[i, 1]
-        r += b[i, 1] * b[i, 1]
-    # Rotate by the angle that makes the columns orthogonal, the larger one first.
+    first = solve_lower(factor, jacobian[0])
+    second = solve_lower(factor, jacobian[1])
+    p, q, r = float(first @ first), float(first @ second), float(second @ second)
     half = 0.5 * (p - r)
     size = hypot(half, q)
     if size > 0.0:
@@ -344,21 +367,40 @@ def correct_along_constraints(factor: Array, jacobian: Array, need_x: float, nee
             c, s = abs(s), (c if q >= 0.0 else -c)
     else:
         c, s = 1.0, 0.0
-    strong = weak = 0.0
+    return c * first + s * second, c * second - s * first, c, s
+
+
+@kernel
+def correct_along_constraints(factor: Array, jacobian: Array, need_x: float, need_y: float,
+                              vector: Array) -> None:
+    """
+    Add to `vector` the M^-1 J^T lambda that changes `J vector` by the need.
+
+    `M = L L^T`. At a change point nothing is done along the weak direction.
+    """
+    strong, weak, c, s = orthogonal_columns(factor, jacobian)
+    size = float(strong @ strong)
+    correction = (c * need_x + s * need_y) / size * strong
+    if weak @ weak > AT_CHANGE_POINT * AT_CHANGE_POINT * size:
+        correction += (c * need_y - s * need_x) / (weak @ weak) * weak
+    add_upper_solution(factor, correction, vector)
+
+
+@kernel
+def solve_lower(factor: Array, vector: Array) -> Array:
+    """Solve L x = vector."""
+    x = np.empty(4)
     for i in range(4):
-        first = c * b[i, 0] + s * b[i, 1]
-        second = c * b[i, 1] - s * b[i, 0]
-        b[i, 0], b[i, 1] = first, second
-        strong += first * first
-        weak += second * second
-    force_strong = (c * need_x + s * need_y) / strong
-    force_weak = 0.0
-    if weak > lost * lost * strong:
-        force_weak = (c * need_y - s * need_x) / weak
-    # vector += L^-T B' force
-    step = np.empty(4)
-    for i in range(4):
-        step[i] = b[i, 0] * force_strong + b[i, 1] * force_weak
+        x[i] = vector[i]
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+    return x
+
+
+@kernel
+def add_upper_solution(factor: Array, step: Array, vector: Array) -> None:
+    """Add the solution x of L^T x = step to the vector; overwrites the step."""
     for i in range(3, -1, -1):
         for k in range(i + 1, 4):
             step[i] -= factor[k, i] * step[k]
@@ -420,10 +462,10 @@ def project_onto_closure(angles: Array, rates: Array, constants: Constants) -> N
         rates[3] = g3 * rates[0] + g4 * rates[1]
         return
     factor = cholesky(mass_matrix(angles, constants))
-    jacobian, _ = closure_derivatives(angles, rates, lengths)
-    correct_along_constraints(factor, jacobian, -gap_x, -gap_y, LOST_FOR_PROJECTION, angles)
+    jacobian = closure_jacobian(angles, lengths)
+    correct_along_constraints(factor, jacobian, -gap_x, -gap_y, angles)
     slip_x = slip_y = 0.0
     for j in range(4):
         slip_x -= jacobian[0, j] * rates[j]
         slip_y -= jacobian[1, j] * rates[j]
-    correct_along_constraints(factor, jacobian, slip_x, slip_y, LOST_FOR_PROJECTION, rates)
+    correct_along_constraints(factor, jacobian, slip_x, slip_y, rates)

@@ -110,15 +110,18 @@ class Mechanism:
         cosine = np.einsum('i,ij,ik->jk', masses, x, x) + np.einsum('i,ij,ik->jk', masses, y, y)
         sine = np.einsum('i,ij,ik->jk', masses, y, x) - np.einsum('i,ij,ik->jk', masses, x, y)
         cosine[range(4), range(4)] += self.link_inertias
-        return Constants(
-            np.array(self.link_lengths), cosine, sine, np.array(self.flywheel_inertias),
-            float(masses.sum()))
+        for matrix in (cosine, sine):
+            matrix.flags.writeable = False
+        return Constants(self.link_lengths, cosine, sine, self.flywheel_inertias,
+                         float(masses.sum()))
 
     @cached_property
     def constants_with_locked_wheels(self) -> Constants:
         """Work out the constants of a linkage whose wheels turn with their links."""
         free = self.constants
-        return free._replace(cosine=free.cosine + np.diag(self.flywheel_inertias))
+        cosine = free.cosine + np.diag(self.flywheel_inertias)
+        cosine.flags.writeable = False
+        return free._replace(cosine=cosine)
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], origin: str) -> Mechanism:
@@ -156,9 +159,12 @@ def load_mechanism(name: str) -> Mechanism:
 
 def _checked_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise MechanismError(f'{name} must hold numbers, got {value!r}') from None
+        given = np.asarray(value)
+    except ValueError:      # rows of different lengths
+        given = np.asarray(None)
+    if given.dtype.kind not in 'iuf':
+        raise MechanismError(f'{name} must hold numbers, got {value!r}')
+    array = np.array(given, dtype=float)
     if array.shape != shape:
         raise MechanismError(f'{name} must have shape {shape}, got {array.shape}')
     unlimited = name.startswith('motor_')

@@ -1,0 +1,118 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A bench of four wheels without a linkage, whose every torque is on record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fourbar_ros.device import (
+    LinkSample,
+    Samples,
+    Testbed,
+    TestbedSettings,
+    Timing,
+    WheelSample,
+)
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism import load_mechanism, Mechanism
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+PERIOD_NS = 4_000_000
+
+
+class Bench:
+    """
+    A device that does what it is told.
+
+    :ivar driven: torques of every step.
+    :ivar links: the links that give a sample.
+    :ivar breaks: whether the next step fails.
+    """
+
+    description = 'bench'
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        self.mechanism = mechanism
+        self.period_ns = PERIOD_NS
+        self.driven: list[Array] = []
+        self.links: tuple[int, ...] = (0, 1, 2, 3)
+        self.breaks = False
+        self.speeds = np.array([10.0, -20.0, 0.0, 5.0])
+
+    def step(self, stamp_ns: int, torques: Array) -> Samples:
+        """Take down the torques and let the wheels follow them."""
+        self.driven.append(np.array(torques))
+        if self.breaks:
+            raise FourbarError('the bus is off')
+        self.speeds = self.speeds + torques / self.mechanism.flywheel_inertias * 4e-3
+        sample = LinkSample(stamp_ns, self.links, np.zeros(len(self.links)))
+        return Samples(stamp_ns, (sample,), WheelSample(np.zeros(4), self.speeds, torques))
+
+
+class Operated:
+    """A testbed around the bench, with both clocks in one hand."""
+
+    def __init__(self, mechanism: Mechanism, settings: TestbedSettings) -> None:
+        self.bench = Bench(mechanism)
+        self.testbed = Testbed(self.bench, settings)
+        self.stamp_ns = 1_000_000_000
+        self.steady_ns = 50_000_000_000
+
+    def tick(self, periods: float = 1.0, steady: float | None = None
+             ) -> tuple[Samples, Timing]:
+        """Let stamps advance by some periods, the steady clock by as many unless told."""
+        self.stamp_ns += round(periods * PERIOD_NS)
+        self.steady_ns += round((periods if steady is None else steady) * PERIOD_NS)
+        result = self.testbed.tick(self.stamp_ns, self.steady_ns)
+        self.testbed.published(self.steady_ns, 1000)
+        return result
+
+    def command(self, *efforts: float, ahead_ns: int = 0, names: list[str] | None = None) -> None:
+        """Command the wheels a, b, ..., as many as there are efforts."""
+        wheels = [f'flywheel_{letter}' for letter in 'abcd'[:len(efforts)]]
+        self.testbed.command(
+            self.stamp_ns + ahead_ns, names or wheels, [], [], list(efforts), self.steady_ns)
+
+    def arm(self, *obstacles: str) -> tuple[bool, str]:
+        """Ask to drive."""
+        return self.testbed.arm(self.steady_ns, obstacles)
+
+    @property
+    def driven(self) -> list[float]:
+        """The torques of the last step."""
+        torques: list[float] = self.bench.driven[-1].tolist()
+        return torques
+
+
+@pytest.fixture(scope='session')
+def paper() -> Mechanism:
+    """Load the linkage of the paper."""
+    return load_mechanism('paper')
+
+
+@pytest.fixture
+def operate(paper: Mechanism) -> Callable[..., Operated]:
+    """Return a function that makes a testbed, armed after its first tick unless told."""
+    def make(armed: bool = True, **settings: object) -> Operated:
+        operated = Operated(paper, TestbedSettings(**settings))  # type: ignore[arg-type]
+        if armed:
+            operated.tick()
+            assert operated.arm() == (True, 'armed')
+        return operated
+    return make

@@ -1,0 +1,533 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Torque reaches the wheels only while armed, within limits, and only as long as commands come."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from math import exp, nan
+from typing import Any
+
+from fourbar_ros.device import (
+    CommandError,
+    DeviceState,
+    SimulatedTable,
+    Testbed,
+    TestbedSettings,
+)
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism import angular_momentum, LINK_NAMES, Mechanism
+from fourbar_ros.plant import InitialState, Plant, PlantError, Table
+from fourbar_ros.plant.table import LinkSensors, WheelEncoders
+from hypothesis import given, note, settings
+from hypothesis import strategies as st
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+Operate = Callable[..., Any]
+
+NONE = [0.0, 0.0, 0.0, 0.0]
+PERIOD_NS = 4_000_000
+LIMIT = 1e-4
+
+
+# Commands
+
+def test_accepted_command_drives_from_the_next_step_on(operate: Operate) -> None:
+    bed = operate()
+    bed.command(1e-5, -2e-5, 3e-5, -4e-5)
+    for _ in range(3):
+        bed.tick()
+        assert bed.driven == [1e-5, -2e-5, 3e-5, -4e-5]
+    bed.command(5e-5)
+    bed.tick()
+    assert bed.driven == [5e-5, 0.0, 0.0, 0.0]
+
+
+def test_more_than_a_motor_has_is_clipped_and_counted(operate: Operate) -> None:
+    bed = operate()
+    bed.command(1.0, -1.0, LIMIT, -LIMIT / 2)
+    bed.tick()
+    assert bed.driven == [LIMIT, -LIMIT, LIMIT, -LIMIT / 2]
+    assert bed.testbed.clipped == 1
+    bed.command(LIMIT, -LIMIT)
+    assert bed.testbed.clipped == 1
+
+
+@pytest.mark.parametrize(('kind', 'fields'), [
+    ('names', (['wheel'], [], [], [0.0])),
+    ('names', (['flywheel_a'] * 2, [], [], [0.0, 0.0])),
+    ('length', (['flywheel_a', 'flywheel_b'], [], [], [0.0])),
+    ('length', ([], [], [], [])),
+    ('finite', (['flywheel_b', 'flywheel_a'], [], [], [0.0, nan])),
+    ('fields', (['flywheel_a'], [], [1.0], [0.0])),
+])
+def test_rejected_command_changes_nothing_but_its_counter(
+    kind: str, fields: tuple[Any, ...], operate: Operate,
+) -> None:
+    bed = operate()
+    bed.command(1e-5, 2e-5)
+    with pytest.raises(CommandError) as caught:
+        bed.testbed.command(bed.stamp_ns, *fields, bed.steady_ns)
+    assert caught.value.kind == kind
+    assert bed.testbed.rejected == Counter({kind: 1})
+    assert bed.testbed.last_rejection == str(caught.value)
+    bed.tick()
+    assert bed.driven == [1e-5, 2e-5, 0.0, 0.0]
+
+
+@pytest.mark.parametrize('ahead_ms', [-101, 1, 1000, -3_600_000])
+def test_stale_or_future_stamp_is_rejected(ahead_ms: int, operate: Operate) -> None:
+    bed = operate()
+    bed.tick(100, steady=1)
+    with pytest.raises(CommandError) as caught:
+        bed.command(1e-5, ahead_ns=ahead_ms * 1_000_000)
+    assert caught.value.kind == 'stale'
+    assert f'{abs(ahead_ms) * 1e-3:g} s' in str(caught.value)
+    assert bed.testbed.rejected == Counter(stale=1)
+    bed.tick()
+    assert bed.driven == NONE
+
+
+def test_stamp_of_a_recent_tick_is_accepted(operate: Operate) -> None:
+    bed = operate()
+    bed.tick(100, steady=1)
+    bed.command(1e-5, ahead_ns=-99_000_000)
+    bed.tick()
+    assert bed.driven[0] == 1e-5
+
+
+def test_command_older_than_the_last_one_is_rejected(operate: Operate) -> None:
+    bed = operate()
+    bed.tick()
+    bed.command(1e-5)
+    with pytest.raises(CommandError, match='older than that of the last command') as caught:
+        bed.command(2e-5, ahead_ns=-PERIOD_NS)
+    assert caught.value.kind == 'stale'
+    bed.command(3e-5)
+    bed.tick()
+    assert bed.driven[0] == 3e-5
+
+
+def test_command_before_the_first_tick_is_rejected(operate: Operate) -> None:
+    bed = operate(armed=False)
+    with pytest.raises(CommandError, match='no tick to answer yet'):
+        bed.command(1e-5)
+
+
+# Arming
+
+def test_old_torque_does_not_come_back_with_arming(operate: Operate) -> None:
+    bed = operate(armed=False)
+    bed.tick()
+    bed.command(1e-5)
+    bed.tick()
+    assert bed.driven == NONE
+    bed.arm()
+    bed.tick()
+    assert bed.driven == NONE
+
+
+def test_arming_again_while_armed_does_not_interrupt(operate: Operate) -> None:
+    bed = operate()
+    bed.command(1e-5)
+    assert bed.arm() == (True, 'already armed')
+    bed.tick()
+    assert bed.driven[0] == 1e-5
+
+
+@pytest.mark.parametrize('silent', [(0,), (1, 3), (0, 1, 2, 3)])
+def test_arming_needs_every_link_sensor(silent: tuple[int, ...], operate: Operate) -> None:
+    bed = operate(armed=False)
+    bed.tick()
+    bed.bench.links = tuple(link for link in range(4) if link not in silent)
+    # 0.2 s of 4 ms are 50 periods.
+    for _ in range(50):
+        bed.tick()
+    assert bed.arm()[0]
+    bed.testbed.disarm('test')
+    bed.tick()
+    armed, message = bed.arm()
+    assert not armed
+    for link, name in enumerate(LINK_NAMES):
+        assert (name in message) is (link in silent)
+    bed.bench.links = (0, 1, 2, 3)
+    bed.tick()
+    assert bed.arm()[0]
+
+
+def test_arming_before_the_first_tick_is_refused(operate: Operate) -> None:
+    armed, message = operate(armed=False).arm()
+    assert not armed
+    assert 'link_a, link_b, link_c, link_d' in message
+
+
+def test_other_obstacles_are_told_too(operate: Operate) -> None:
+    bed = operate(armed=False)
+    assert 'two publishers' in bed.arm('two publishers')[1]
+    bed.tick()
+    assert bed.arm('two publishers') == (False, 'refused: two publishers')
+
+
+@pytest.mark.parametrize('way', ['disarm', 'emergency_stop'])
+def test_every_way_out_of_armed_ends_torque(way: str, operate: Operate) -> None:
+    bed = operate()
+    bed.command(1e-5)
+    bed.tick()
+    getattr(bed.testbed, way)('test')
+    bed.tick()
+    assert bed.driven == NONE
+    bed.command(1e-5)
+    bed.tick()
+    assert bed.driven == NONE
+    if way == 'emergency_stop':
+        assert not bed.arm()[0]
+        assert bed.testbed.reset()[0]
+        assert bed.testbed.gate.state is DeviceState.DISARMED
+    assert bed.arm()[0]
+    bed.tick()
+    assert bed.driven == NONE
+
+
+def test_failing_device_latches_a_fault(operate: Operate) -> None:
+    bed = operate()
+    bed.command(1e-5)
+    bed.bench.breaks = True
+    with pytest.raises(FourbarError, match='bus is off'):
+        bed.tick()
+    bed.bench.breaks = False
+    assert bed.testbed.gate.state is DeviceState.FAULT
+    assert bed.testbed.gate.reason == 'the bus is off'
+    bed.tick()
+    assert bed.driven == NONE
+    assert not bed.arm()[0]
+    bed.testbed.reset()
+    assert bed.arm()[0]
+    bed.tick()
+    assert bed.driven == NONE
+
+
+# Watchdog
+
+def test_watchdog_disarms_after_the_timeout(operate: Operate) -> None:
+    bed = operate()
+    bed.command(1e-5)
+    # The command holds for 0.1 s: 25 periods of 4 ms, and not one more.
+    for _ in range(25):
+        bed.tick()
+        assert bed.driven[0] == 1e-5
+    bed.tick()
+    assert bed.driven == NONE
+    assert bed.testbed.gate.state is DeviceState.DISARMED
+    assert bed.testbed.gate.reason == 'no flywheel_command for 0.1 s'
+    bed.command(1e-5)
+    bed.tick()
+    assert bed.driven == NONE
+
+
+def test_watchdog_waits_as_long_for_the_first_command(operate: Operate) -> None:
+    bed = operate()
+    for _ in range(25):
+        bed.tick()
+    assert bed.testbed.gate.armed
+    bed.tick()
+    assert not bed.testbed.gate.armed
+
+
+def test_commands_in_time_keep_it_armed(operate: Operate) -> None:
+    bed = operate()
+    for _ in range(200):
+        bed.command(1e-5)
+        bed.tick()
+    assert bed.testbed.gate.armed
+
+
+def test_frozen_stamps_do_not_disable_the_watchdog(operate: Operate) -> None:
+    bed = operate()
+    for _ in range(26):
+        bed.tick(periods=1e-6, steady=1.0)
+    assert not bed.testbed.gate.armed
+
+
+def test_stamps_that_run_away_do_not_trip_the_watchdog(operate: Operate) -> None:
+    bed = operate()
+    for _ in range(25):
+        bed.tick(periods=1000.0, steady=1.0)
+    assert bed.testbed.gate.armed
+
+
+def test_rejected_commands_do_not_feed_the_watchdog(operate: Operate) -> None:
+    bed = operate()
+    for _ in range(26):
+        bed.tick()
+        with pytest.raises(CommandError):
+            bed.command(nan)
+    assert not bed.testbed.gate.armed
+    assert bed.testbed.rejected == Counter(finite=26)
+
+
+@pytest.fixture(scope='module')
+def uneven() -> Mechanism:
+    """Make a linkage whose link rates change when it moves freely."""
+    return Mechanism(  # type: ignore[arg-type]
+        [0.12, 0.08, 0.11, 0.10], [0.02, 0.03, 0.025, 0.018], [2.2e-5, 1.5e-5, 3e-5, 1.8e-5],
+        [[0.05, 0.01], [0.04, -0.01], [0.06, 0.005], [0.05, 0.0]], [3e-7, 4e-7, 5e-7, 2e-7],
+        [1e-4] * 4, [500.0] * 4)
+
+
+def left_alone(mechanism: Mechanism, action: str) -> tuple[list[Any], Testbed]:
+    """
+    Spin up the wheels of a moving linkage, then stop commanding.
+
+    :returns: ground truth of every tick since the watchdog's, 1 s.
+    """
+    plant = Plant(mechanism, Table(LinkSensors(0.0, 0), WheelEncoders(0)),
+                  InitialState(0.3, 1.6, 'open', 1.0, 0.6), 5e-4, np.random.default_rng(0))
+    testbed = Testbed(SimulatedTable(plant, PERIOD_NS), TestbedSettings(timeout_action=action))
+    truths = []
+    for n in range(320):
+        now = (1 + n) * PERIOD_NS
+        samples, _ = testbed.tick(now, now)
+        if n == 0:
+            assert testbed.arm(now, [])[0]
+        if n < 40:
+            testbed.command(now, ['flywheel_a', 'flywheel_c'], [], [], [4e-5, -3e-5], now)
+        if not testbed.gate.armed and n:
+            truths.append(samples.truth)
+    assert len(truths) > 250
+    return truths, testbed
+
+
+def momentum(mechanism: Mechanism, truth: Any) -> float:
+    return angular_momentum(mechanism, truth.link_angles, truth.link_rates,
+                            truth.wheel_speeds + truth.link_rates)
+
+
+def test_coasting_wheels_keep_their_momentum(uneven: Mechanism) -> None:
+    truths, _ = left_alone(uneven, 'coast')
+    absolute = np.array([truth.wheel_speeds + truth.link_rates for truth in truths])
+    np.testing.assert_allclose(absolute, absolute[0] + np.zeros((len(absolute), 4)), rtol=1e-14)
+    assert not any(truth.efforts.any() for truth in truths)
+
+
+def test_hold_speed_keeps_the_wheels_on_links_that_change_theirs(uneven: Mechanism) -> None:
+    truths, testbed = left_alone(uneven, 'hold_speed')
+    speeds = np.array([truth.wheel_speeds for truth in truths])
+    rates = np.array([truth.link_rates for truth in truths])
+    # A proportional loop of 30 rad/s follows an acceleration with an error of acceleration / 30;
+    # delays of 1.5 periods of 4 ms cost it a fifth.
+    bound = 1.25 * np.abs(np.diff(rates, axis=0)).max() / 4e-3 / 30.0
+    assert np.abs(speeds - speeds[0]).max() < bound
+    # Without the loop they would stray by what the links do.
+    assert np.abs(rates - rates[0]).max() > 5.0 * bound
+    assert testbed.gate.state is DeviceState.DISARMED
+    assert momentum(uneven, truths[-1]) == pytest.approx(momentum(uneven, truths[0]), rel=1e-11)
+
+
+def test_brake_brings_the_wheels_to_rest(uneven: Mechanism) -> None:
+    still = replace(uneven, link_lengths=np.array([0.1, 0.1, 0.1, 0.1]),
+                    com_positions=np.array([[0.05, 0.0]] * 4),
+                    link_masses=np.full(4, 0.02), link_inertias=np.full(4, 2.2e-5))
+    truths, testbed = left_alone(still, 'brake')
+    speeds = np.array([truth.wheel_speeds for truth in truths])
+    # At 2e-7 kg m^2 and more, 1e-4 N m takes some 20 rad/s away in 0.1 s; the rest, 0.9 s, goes
+    # with at least 20 of the loop's 30 rad/s. A rhombus keeps its link rates, so nothing is left.
+    assert np.abs(speeds[0]).max() > 10.0
+    assert np.abs(speeds[-1]).max() < np.abs(speeds[0]).max() * exp(-20.0 * 0.9)
+    assert testbed.gate.state is DeviceState.DISARMED
+    # All of their momentum is in the links now.
+    assert momentum(still, truths[-1]) == pytest.approx(momentum(still, truths[0]), rel=1e-11)
+
+
+@pytest.mark.parametrize('way', ['disarm', 'emergency_stop', 'fault', 'fault, then reset', 'arm'])
+def test_parking_ends_with_whatever_comes_next(way: str, operate: Operate) -> None:
+    bed = operate(timeout_action='brake')
+    for _ in range(30):
+        bed.tick()
+    assert any(bed.driven)
+    if way == 'arm':
+        assert bed.arm()[0]
+    elif way.startswith('fault'):
+        bed.bench.breaks = True
+        with pytest.raises(FourbarError):
+            bed.tick()
+        bed.bench.breaks = False
+        if way != 'fault':
+            bed.testbed.reset()
+    else:
+        getattr(bed.testbed, way)('test')
+    bed.bench.speeds = np.full(4, 50.0)
+    bed.tick()
+    bed.tick()
+    assert bed.driven == NONE
+
+
+def test_parking_respects_the_torque_limit(operate: Operate) -> None:
+    bed = operate(timeout_action='brake')
+    bed.bench.speeds = np.full(4, 400.0)
+    for _ in range(40):
+        bed.tick()
+        assert np.abs(bed.driven).max() <= LIMIT
+    assert np.abs(bed.driven).max() == LIMIT
+
+
+# Whatever happens
+
+ticks = st.tuples(st.just('tick'), st.sampled_from([1.0, 1.0, 1.0, 30.0]))
+commands = st.tuples(st.just('command'), st.lists(
+    st.sampled_from([0.0, 5e-5, -1e-4, 1.0, nan]), min_size=0, max_size=4))
+others = st.sampled_from(['arm', 'disarm', 'stop', 'reset', 'fail', 'silence', 'old command'])
+
+
+@settings(deadline=None, max_examples=400, derandomize=True)
+@given(
+    action=st.sampled_from(['coast', 'hold_speed', 'brake']),
+    events=st.lists(st.one_of(ticks, ticks, commands, others.map(lambda name: (name, None))),
+                    max_size=60))
+def test_wheels_are_driven_only_when_allowed_and_within_limits(
+    action: str, events: list[tuple[str, Any]], operate: Operate,
+) -> None:
+    """
+    Torque passes only while armed, or parking after the watchdog, and never beyond the limits.
+
+    Armed and without an accepted command since, there is none either.
+    """
+    bed = operate(armed=False, timeout_action=action)
+    gate = bed.testbed.gate
+    commanded = False
+    for name, value in events:
+        before = gate.state
+        if name == 'tick':
+            try:
+                bed.tick(value)
+            except FourbarError:
+                bed.bench.breaks = False
+            torques = np.abs(bed.driven)
+            assert torques.max() <= LIMIT
+            parking = (action != 'coast' and gate.state is DeviceState.DISARMED
+                       and gate.reason.startswith('no flywheel_command'))
+            failed_just_now = gate.state is DeviceState.FAULT and before is DeviceState.ARMED
+            if torques.any():
+                note(f'{gate.state} {gate.reason}')
+                assert (gate.armed and commanded) or parking or failed_just_now
+        elif name == 'command':
+            try:
+                bed.command(*value)
+                commanded = True
+            except CommandError:
+                pass
+        elif name == 'old command':
+            with pytest.raises(CommandError):
+                bed.command(1e-5, ahead_ns=-200_000_000)
+        elif name == 'arm':
+            if bed.arm()[0] and before is not DeviceState.ARMED:
+                commanded = False
+        elif name == 'disarm':
+            bed.testbed.disarm('test')
+        elif name == 'stop':
+            bed.testbed.emergency_stop('test')
+        elif name == 'reset':
+            bed.testbed.reset()
+        elif name == 'fail':
+            bed.bench.breaks = True
+        elif name == 'silence':
+            bed.bench.links = (0, 1)
+
+
+# Timing
+
+def test_nothing_is_known_before_the_first_answer(operate: Operate) -> None:
+    bed = operate(armed=False)
+    for _ in range(3):
+        _, timing = bed.tick()
+        assert (timing.round_trip_s, timing.command_age_s, timing.lost) == (None, None, 0)
+
+
+def test_round_trip_and_age_are_on_the_steady_clock(operate: Operate) -> None:
+    bed = operate()
+    bed.tick()
+    bed.steady_ns += 700_000
+    bed.command(0.0)
+    _, timing = bed.tick()
+    assert timing.round_trip_s == pytest.approx(0.7e-3, rel=1e-12)
+    assert timing.command_age_s == pytest.approx(4e-3, rel=1e-12)
+    assert timing.step_s == pytest.approx(1e-6, rel=1e-12)
+    _, timing = bed.tick()
+    assert timing.round_trip_s is None
+    assert timing.command_age_s == pytest.approx(8e-3, rel=1e-12)
+
+
+def test_only_the_first_answer_counts_as_the_round_trip(operate: Operate) -> None:
+    bed = operate()
+    bed.tick()
+    bed.steady_ns += 700_000
+    bed.command(0.0)
+    bed.steady_ns += 700_000
+    bed.command(0.0)
+    _, timing = bed.tick()
+    assert timing.round_trip_s == pytest.approx(0.7e-3, rel=1e-12)
+
+
+def test_ticks_without_an_answer_in_time_are_lost(operate: Operate) -> None:
+    bed = operate()
+    bed.command(0.0)
+    assert bed.tick()[1].lost == 0
+    assert bed.tick()[1].lost == 1
+    # The answer to the tick before this one comes too late to save it, and is none to this one.
+    bed.command(0.0, ahead_ns=-PERIOD_NS)
+    _, timing = bed.tick()
+    assert timing.lost == 2
+    assert timing.round_trip_s is None
+    bed.command(0.0)
+    assert bed.tick()[1].lost == 2
+
+
+def test_rejected_command_is_no_answer(operate: Operate) -> None:
+    bed = operate()
+    bed.command(0.0)
+    bed.tick()
+    with pytest.raises(CommandError):
+        bed.command(nan)
+    assert bed.tick()[1].lost == 1
+
+
+# The simulated table as a device
+
+def test_wheel_speeds_are_what_the_encoders_moved(paper: Mechanism) -> None:
+    plant = Plant(paper, Table(LinkSensors(0.0, 0), WheelEncoders(4096)), InitialState(), 5e-4,
+                  np.random.default_rng(0))
+    table = SimulatedTable(plant, PERIOD_NS)
+    before = table.step(0, np.zeros(4))
+    for n in range(1, 20):
+        # Every third tick comes two periods late.
+        stamp = before.stamp_ns + PERIOD_NS * (3 if n % 3 == 0 else 1)
+        now = table.step(stamp, np.full(4, 5e-5))
+        moved = (now.wheels.angles - before.wheels.angles) / ((stamp - before.stamp_ns) * 1e-9)
+        np.testing.assert_allclose(now.wheels.speeds, moved, rtol=1e-12)
+        before = now
+    # 5e-5 N m all along: time has passed for the wheels as for the stamps.
+    expected = 5e-5 / paper.flywheel_inertias * before.stamp_ns * 1e-9
+    truth = before.truth
+    assert truth is not None
+    np.testing.assert_allclose(truth.wheel_speeds + truth.link_rates, expected, rtol=1e-11)
+
+
+def test_period_that_is_no_multiple_of_the_step_is_refused(paper: Mechanism) -> None:
+    plant = Plant(paper, Table(LinkSensors(0.0, 0), WheelEncoders(0)), InitialState(), 3e-4,
+                  np.random.default_rng(0))
+    with pytest.raises(PlantError, match='whole multiple'):
+        SimulatedTable(plant, PERIOD_NS)

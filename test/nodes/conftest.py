@@ -1,0 +1,400 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Nodes in processes of their own on a domain of their own, and a probe that watches them."""
+
+from contextlib import contextmanager
+import fcntl
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from fourbar_ros.configuration import share_directory
+from fourbar_ros.loop.warm_up import warm_up
+from fourbar_ros.mechanism import FLYWHEEL_NAMES
+import pytest
+import rclpy
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+
+DEADLINE_S = 20.0
+DOMAINS = range(1, 102)
+
+DEEP = QoSProfile(depth=5000)
+COMMAND = QoSProfile(depth=10)
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+# A node ends in this order, so that none complains about another one's silence.
+STOP_ORDER = ('controller', 'estimator', 'plant')
+
+# For a process that will be killed: Fast DDS leaves its shared memory behind.
+NO_SHARED_MEMORY = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
+
+
+def stamp_of(message):
+    """Return the stamp of a message [ns]."""
+    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+
+
+def set_stamp(message, stamp_ns):
+    """Write a stamp [ns] into a message, and return it."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+    return message
+
+
+def values_of(status):
+    """Return the values of a DiagnosticStatus as a dict."""
+    return {item.key: item.value for item in status.values}
+
+
+@contextmanager
+def claimed_domain():
+    """Hold a ROS domain that no other test run on this machine uses, under a lock file."""
+    for number in DOMAINS:
+        path = Path(tempfile.gettempdir(), f'fourbar_ros_domain_{number}.lock')
+        try:
+            lock = path.open('w')
+        except OSError:     # another user's
+            continue
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if os.fstat(lock.fileno()).st_ino != path.stat().st_ino:
+                    continue    # removed by its holder while we opened it
+            except (BlockingIOError, FileNotFoundError):
+                continue
+            try:
+                yield number
+            finally:
+                path.unlink()
+            return
+    pytest.fail('every domain from 1 to 101 is taken')
+
+
+class Process:
+    """
+    One `fourbar NAME ...` in a process of its own.
+
+    :param folder: for what it prints.
+    :ivar shared_memory: files of the middleware that it was seen to use.
+    """
+
+    def __init__(self, name, arguments, environment, folder, **options):
+        self.name = name
+        self.shared_memory = set()
+        self._out, self._err = (folder / f'{stream}.txt' for stream in ('stdout', 'stderr'))
+        with self._out.open('wb') as out, self._err.open('wb') as err:
+            self.popen = subprocess.Popen(
+                [sys.executable, '-m', 'fourbar_ros', name, *arguments], cwd=folder,
+                stdin=subprocess.DEVNULL, stdout=out, stderr=err,
+                env={**os.environ, **environment}, **options)
+
+    @property
+    def stdout(self):
+        """What it printed so far."""
+        return self._out.read_text()
+
+    @property
+    def stderr(self):
+        """What it complained about so far."""
+        return self._err.read_text()
+
+    def send(self, number):
+        """Send a signal."""
+        self.popen.send_signal(number)
+
+    def end(self, number=None, seconds=DEADLINE_S):
+        """Wait for the end, after a signal if one is given, and return the exit code."""
+        if self.popen.poll() is None:
+            self.shared_memory |= shared_memory_of(self.popen.pid)
+            if number is not None:
+                self.popen.send_signal(signal.SIGCONT)
+                self.popen.send_signal(number)
+        return self.popen.wait(seconds)
+
+    def check_clean(self):
+        """Fail unless it ended as asked and without an outcry."""
+        assert (self.name, self.popen.returncode) == (self.name, 0), self.stderr
+        for word in ('Traceback', 'FATAL', 'Error', 'terminate called'):
+            assert word not in self.stdout + self.stderr
+
+
+def shared_memory_of(pid):
+    """Return the middleware's shared-memory files that a process uses."""
+    names = set()
+    for line in Path(f'/proc/{pid}/maps').read_text().splitlines():
+        path = line.rpartition(' ')[2]
+        if path.startswith(('/dev/shm/fast', '/dev/shm/sem.fast')):
+            names.add(path)
+    return names
+
+
+def orphans(paths):
+    """Return those of some shared-memory files that exist although no process uses them."""
+    left = {path for path in paths if Path(path).exists()}
+    for folder in Path('/proc').glob('[0-9]*') if left else ():
+        try:
+            left -= shared_memory_of(folder.name)
+        except OSError:     # it ended, or is another user's
+            continue
+    return left
+
+
+class Suite:
+    """
+    Processes of one test or module, all of which end with it.
+
+    :param folder: for what they print.
+    """
+
+    def __init__(self, folder):
+        self._folder = folder
+        self._started = []
+        self._before = set(map(str, Path('/dev/shm').glob('*fast*')))
+
+    def start(self, name, *arguments, environment=None, **options):
+        """Start `fourbar NAME ARGUMENTS`."""
+        folder = self._folder / f'{len(self._started)}_{name}'
+        folder.mkdir()
+        process = Process(name, arguments, environment or {}, folder, **options)
+        self._started.append(process)
+        return process
+
+    def node(self, name, parameters=None, namespace='', environment=None, arguments=()):
+        """Start a node with parameters in a namespace."""
+        ros_args = ['--ros-args']
+        for key, value in (parameters or {}).items():
+            ros_args += ['-p', f'{key}:={value}']
+        if namespace:
+            ros_args += ['-r', f'__ns:={namespace}']
+        ros_args += arguments
+        return self.start(
+            name, *(ros_args if ros_args[1:] else ()), environment=environment)
+
+    def nodes(self, namespace='', **parameters):
+        """Start plant, estimator and controller; parameters by the name of the node."""
+        return {name: self.node(name, parameters.get(name), namespace)
+                for name in ('plant', 'estimator', 'controller')}
+
+    def close(self):
+        """Stop what still runs and check that all nodes ended cleanly."""
+        running = [process for process in self._started if process.popen.poll() is None]
+        try:
+            for name in STOP_ORDER:
+                for process in running:
+                    if process.name == name:
+                        process.end(signal.SIGINT)
+            for process in running:
+                process.end(signal.SIGINT)
+            for process in running:
+                if process.name in STOP_ORDER:
+                    process.check_clean()
+        finally:
+            for process in self._started:
+                if process.popen.poll() is None:
+                    process.popen.kill()
+                    process.popen.wait()
+
+    def left_behind(self):
+        """Return the shared memory that the ended processes made and nobody uses any more."""
+        return orphans(set().union(
+            *(process.shared_memory for process in self._started)) - self._before)
+
+
+class Probe:
+    """
+    A node of the tests: it listens, asks, drives wheels, and waits for conditions.
+
+    :ivar received: list of messages by the topic's relative name, see `follow`.
+    """
+
+    def __init__(self, domain, namespace=''):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=domain,
+                   signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node('probe', context=self.context, namespace=namespace or None,
+                         enable_rosout=False, start_parameter_services=False)
+        self._executor = EventsExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self.received = {}
+        self._driving = None
+        self._torques = [0.0] * 4
+
+    def close(self):
+        """End ROS in this context."""
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+    def wait(self, condition, seconds=DEADLINE_S):
+        """Run callbacks until a condition holds, and return what it returned."""
+        end = time.monotonic() + seconds
+        while not (result := condition()):
+            assert time.monotonic() < end, 'it did not happen in time'
+            self._executor.spin_once(timeout_sec=0.02)
+        return result
+
+    def follow(self, *topics, kind=JointState, qos=DEEP):
+        """Collect what comes on some topics, and return the list of (the last of) them."""
+        for topic in topics:
+            if topic not in self.received:
+                self.received[topic] = []
+                self.node.create_subscription(kind, topic, self.received[topic].append, qos)
+        return self.received[topics[-1]]
+
+    def newest(self, topic):
+        """Return the newest message of a followed topic, after waiting for the first."""
+        return self.wait(lambda: self.received[topic])[-1]
+
+    def more(self, topic, count=1):
+        """Wait for more messages of a followed topic, and return exactly so many."""
+        messages = self.received[topic]
+        begin = len(messages)
+        self.wait(lambda: len(messages) >= begin + count)
+        return messages[begin:begin + count]
+
+    def status(self, topic, **wanted):
+        """Follow a latched status until it has some values, and return all of them."""
+        received = self.follow(topic, kind=DiagnosticStatus, qos=LATCHED)
+        self.wait(lambda: received and wanted.items() <= values_of(received[-1]).items())
+        return values_of(received[-1])
+
+    def diagnosis(self, node, condition=lambda status: True):
+        """Wait for a new status of a node on /diagnostics that fulfils a condition."""
+        arrays = self.follow('/diagnostics', kind=DiagnosticArray)
+        begin = len(arrays)
+
+        def found():
+            return next((status for array in arrays[begin:] for status in array.status
+                         if status.name == node and condition(status)), None)
+        return self.wait(found)
+
+    def counts(self, node, prefix):
+        """Return the counters of a node on /diagnostics whose names begin with a prefix."""
+        return {key[len(prefix):]: int(value)
+                for key, value in values_of(self.diagnosis(node)).items()
+                if key.startswith(prefix)}
+
+    def call(self, kind, service, request):
+        """Call a service and return its response."""
+        client = self.node.create_client(kind, service)
+        self.wait(client.service_is_ready)
+        future = client.call_async(request)
+        self.wait(future.done)
+        self.node.destroy_client(client)
+        return future.result()
+
+    def arm(self, wanted=True):
+        """Ask the device to arm or disarm."""
+        return self.call(SetBool, 'arm', SetBool.Request(data=wanted))
+
+    def trigger(self, service):
+        """Call a service without arguments."""
+        return self.call(Trigger, service, Trigger.Request())
+
+    def publisher(self, kind, topic, qos=COMMAND):
+        """Make a publisher and wait until somebody listens."""
+        publisher = self.node.create_publisher(kind, topic, qos)
+        self.wait(publisher.get_subscription_count)
+        return publisher
+
+    def drive(self, torques):
+        """Answer every tick with these torques [N m] from now on, None to stop answering."""
+        self._torques = torques
+        if self._driving is None:
+            self._driving = self.publisher(JointState, 'flywheel_command')
+            self.node.create_subscription(JointState, 'flywheel_states', self._answer, DEEP)
+            self.wait(lambda: self.node.count_publishers(
+                self.node.resolve_topic_name('flywheel_states')))
+
+    def command(self, stamp_ns, names=FLYWHEEL_NAMES, **fields):
+        """Send one wheel command."""
+        self._driving.publish(set_stamp(JointState(name=list(names), **fields), stamp_ns))
+
+    def _answer(self, tick):
+        if self._torques is not None:
+            self.command(stamp_of(tick), effort=self._torques)
+
+    def setpoint_verdict(self, message, publisher):
+        """Send a setpoint and return the values of controller_status after the verdict."""
+        before = self.status('controller_status')
+        publisher.publish(message)
+        received = self.received['controller_status']
+
+        def judged():
+            now = values_of(received[-1])
+            return now if any(now[key] != before[key] for key in ('accepted', 'refused')) else None
+        return self.wait(judged)
+
+
+@pytest.fixture(scope='session')
+def compiled():
+    """Compile the kernels before nodes have to answer in time."""
+    warm_up()
+
+
+@pytest.fixture(scope='module')
+def domain(compiled):
+    """Give the module a domain of its own, and its processes the environment for it."""
+    with claimed_domain() as number, pytest.MonkeyPatch.context() as patch:
+        patch.setenv('ROS_DOMAIN_ID', str(number))
+        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        patch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE',
+                     str(share_directory() / 'config' / 'fastdds_loopback.xml'))
+        yield number
+
+
+@pytest.fixture(scope='module')
+def module_suite(domain, tmp_path_factory):
+    """Run processes until the end of the module, which must leave nothing behind."""
+    suite = Suite(tmp_path_factory.mktemp('module'))
+    yield suite
+    suite.close()
+    assert suite.left_behind() == set()
+
+
+@pytest.fixture
+def suite(domain, tmp_path):
+    """Run processes until the end of the test, which must leave nothing behind."""
+    suite = Suite(tmp_path)
+    yield suite
+    suite.close()
+    assert suite.left_behind() == set()
+
+
+@pytest.fixture(scope='module')
+def make_probe(domain):
+    """Return a function that makes a probe, closed at the end of the module."""
+    probes = []
+
+    def make(namespace=''):
+        probes.append(Probe(domain, namespace))
+        return probes[-1]
+    yield make
+    for probe in probes:
+        probe.close()
+
+
+@pytest.fixture(scope='module')
+def probe(make_probe):
+    """Watch the module's nodes."""
+    return make_probe()
