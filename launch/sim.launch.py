@@ -18,6 +18,7 @@ Simulated table, estimator and controller: `ros2 launch fourbar_ros sim.launch.p
 The numerical kernels are compiled first (some ten seconds, once), then the nodes start.
 """
 
+from launch import LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
     ExecuteProcess,
@@ -27,8 +28,6 @@ from launch.actions import (
 from launch.event_handlers import OnProcessExit
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-
-from launch import LaunchDescription
 
 EXECUTABLES = ('plant', 'estimator', 'controller')
 

@@ -332,7 +332,7 @@ def _limit_lines(axes: Axes, limits: Floats | None, largest: float, factor: floa
 
 
 def energy(view: View) -> Figure:
-    """Plot the flywheel energy (paper eq. 7), eq. 9 and the work of the motors."""
+    """Plot flywheel energy by paper eq. 7, its eq. 9, and the work of the motors."""
     figure = Figure(figsize=(style.WIDTH_IN, 2.7), layout='constrained')
     panels = figure.subplots(1, 3)
     curves: list[tuple[int, str, Nanoseconds, Floats, dict[str, Any]]] = []

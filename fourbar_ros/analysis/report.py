@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from datetime import datetime
+from functools import partial
 import html as markup
 import json
 from pathlib import Path
@@ -133,8 +134,8 @@ def make_page(recording: Recording, mechanism: Mechanism | None, result: dict[st
     parts = []
     for name, heading, caption in progress(SECTIONS, len(SECTIONS)) if progress else SECTIONS:
         try:
-            body = (f'<figure>{style.draw(lambda: getattr(figures, name)(view), name)}'  # noqa: B023
-                    f'<figcaption>{_text(caption)}</figcaption></figure>')
+            drawing = style.draw(partial(getattr(figures, name), view), name)
+            body = f'<figure>{drawing}<figcaption>{_text(caption)}</figcaption></figure>'
         except BagError as error:
             body = f'<p class="absent">Not in this report: {_text(error)}.</p>'
         parts.append(f'<section id="{name}"><h2>{heading}</h2>{body}</section>')

@@ -90,9 +90,9 @@ def run(args: argparse.Namespace) -> int:
     from fourbar_ros.nodes.environment import check_environment
     check_environment()
     from fourbar_ros.loop.warm_up import main as compile_kernels
-    from fourbar_ros.nodes.operator import Operator
+    from fourbar_ros.nodes.client import TestbedClient
 
-    with Operator() as testbed, ExitStack() as stack:
+    with TestbedClient() as testbed, ExitStack() as stack:
         _refuse_second_plant(testbed)
         stack.enter_context(_locked(args.output))
         _prepare(args.output)

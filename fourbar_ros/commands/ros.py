@@ -30,7 +30,7 @@ def add_ros_arguments(parser: argparse.ArgumentParser) -> None:
         help='ROS arguments, for instance -r __ns:=/lab')
 
 
-def operator(args: argparse.Namespace) -> Any:
+def testbed_client(args: argparse.Namespace) -> Any:
     """
     Make the operator's node.
 
@@ -38,8 +38,8 @@ def operator(args: argparse.Namespace) -> Any:
     """
     from fourbar_ros.nodes.environment import check_environment
     check_environment()
-    from fourbar_ros.nodes.operator import Operator
-    return Operator(['--ros-args', *args.ros_args] if args.ros_args else [])
+    from fourbar_ros.nodes.client import TestbedClient
+    return TestbedClient(['--ros-args', *args.ros_args] if args.ros_args else [])
 
 
 def report_verdict(success: bool, message: str) -> int:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 
-from fourbar_ros.commands.ros import add_ros_arguments, operator, report_verdict
+from fourbar_ros.commands.ros import add_ros_arguments, report_verdict, testbed_client
 
 CALLS = {
     'arm': lambda testbed: testbed.arm(True),
@@ -35,5 +35,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Call the service and tell the answer; exit code 1 if it is a refusal."""
-    with operator(args) as testbed:
+    with testbed_client(args) as testbed:
         return report_verdict(*CALLS[args.command](testbed))

@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 from math import isfinite, radians
 
-from fourbar_ros.commands.ros import add_ros_arguments, operator, report_verdict
+from fourbar_ros.commands.ros import add_ros_arguments, report_verdict, testbed_client
 from fourbar_ros.errors import FourbarError
 
 EPILOG = """\
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Send the setpoint and tell the verdict."""
     goals = [parse_goal(text) for text in args.goals]
-    with operator(args) as testbed:
+    with testbed_client(args) as testbed:
         accepted, reason = testbed.setpoint(*zip(*goals))
     return report_verdict(accepted, 'accepted' if accepted else f'refused: {reason}')
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 
-from fourbar_ros.commands.ros import add_ros_arguments, operator, REFUSED
+from fourbar_ros.commands.ros import add_ros_arguments, REFUSED, testbed_client
 
 SOURCES = {'device': 'device_status', 'controller': 'controller_status'}
 
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print both states."""
-    with operator(args) as testbed:
+    with testbed_client(args) as testbed:
         testbed.follow(*SOURCES.values())
         testbed.wait(lambda: len(testbed.statuses) == len(SOURCES), seconds=3.0)
         statuses = testbed.statuses

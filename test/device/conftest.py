@@ -106,7 +106,7 @@ def paper() -> Mechanism:
     return load_mechanism('paper')
 
 
-@pytest.fixture
+@pytest.fixture(scope='session')
 def operate(paper: Mechanism) -> Callable[..., Operated]:
     """Return a function that makes a testbed, armed after its first tick unless told."""
     def make(armed: bool = True, **settings: object) -> Operated:

@@ -305,7 +305,9 @@ def left_alone(mechanism: Mechanism, action: str) -> tuple[list[Any], Testbed]:
         if n == 0:
             assert testbed.arm(now, [])[0]
         if n < 40:
-            testbed.command(now, ['flywheel_a', 'flywheel_c'], [], [], [4e-5, -3e-5], now)
+            # The last command lets them coast, so that they are steady when the watchdog comes.
+            drive = [4e-5, -3e-5] if n < 39 else [0.0, 0.0]
+            testbed.command(now, ['flywheel_a', 'flywheel_c'], [], [], drive, now)
         if not testbed.gate.armed and n:
             truths.append(samples.truth)
     assert len(truths) > 250
@@ -482,18 +484,35 @@ def test_only_the_first_answer_counts_as_the_round_trip(operate: Operate) -> Non
     assert timing.round_trip_s == pytest.approx(0.7e-3, rel=1e-12)
 
 
-def test_ticks_without_an_answer_in_time_are_lost(operate: Operate) -> None:
+@settings(deadline=None, derandomize=True)
+@given(delays=st.lists(
+    st.one_of(st.none(), st.integers(0, 4_000_000), st.integers(4_000_001, 12_000_000)),
+    max_size=20))
+def test_ticks_without_an_answer_within_one_period_are_lost(
+    delays: list[int | None], operate: Operate,
+) -> None:
+    """The first tick is answered at once, the others after delays [ns] or never (None)."""
     bed = operate()
-    bed.command(0.0)
-    assert bed.tick()[1].lost == 0
-    assert bed.tick()[1].lost == 1
-    # The answer to the tick before this one comes too late to save it, and is none to this one.
-    bed.command(0.0, ahead_ns=-PERIOD_NS)
-    _, timing = bed.tick()
-    assert timing.lost == 2
-    assert timing.round_trip_s is None
-    bed.command(0.0)
-    assert bed.tick()[1].lost == 2
+    answers = [(n * PERIOD_NS + delay, n) for n, delay in enumerate([0, *delays])
+               if delay is not None]
+    start, first = bed.steady_ns, bed.stamp_ns
+    for n in range(len(delays) + 4):
+        if n:
+            bed.steady_ns = start + (n - 1) * PERIOD_NS
+            _, timing = bed.tick()
+        for due, answered in sorted(answers):
+            if n * PERIOD_NS <= due < (n + 1) * PERIOD_NS:
+                bed.steady_ns = start + due
+                try:
+                    bed.command(0.0, ahead_ns=first + answered * PERIOD_NS - bed.stamp_ns)
+                except CommandError:
+                    # An answer that was overtaken by a newer one, so more than a period late.
+                    pass
+        bed.steady_ns = start + n * PERIOD_NS
+        if n == len(delays) + 3:
+            # The ticks after the last delay wait for an answer still: two are overdue.
+            late = sum(delay is None or delay > PERIOD_NS for delay in delays)
+            assert timing.lost == late + 1
 
 
 def test_rejected_command_is_no_answer(operate: Operate) -> None:
@@ -502,7 +521,10 @@ def test_rejected_command_is_no_answer(operate: Operate) -> None:
     bed.tick()
     with pytest.raises(CommandError):
         bed.command(nan)
-    assert bed.tick()[1].lost == 1
+    bed.tick()
+    _, timing = bed.tick()
+    assert timing.lost == 1
+    assert timing.round_trip_s is None
 
 
 # The simulated table as a device

@@ -28,7 +28,7 @@ from std_srvs.srv import SetBool, Trigger
 PATIENCE = 5.0
 
 
-class Operator:
+class TestbedClient:
     """
     A short-lived node; use as a context manager.
 
@@ -45,7 +45,7 @@ class Operator:
         self._setpoints = None
 
     def __enter__(self):
-        """Return the operator."""
+        """Return the client."""
         return self
 
     def __exit__(self, *_):
