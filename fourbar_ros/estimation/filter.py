@@ -51,7 +51,6 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
     The filter proper: predict with wheel motion, correct with link angles.
 
     :ivar angles: (4,) link angles that belong to x, continuous [rad].
-    :ivar gamma: (2, 2) in use, `(omega_c, omega_d) = gamma (omega_a, omega_b)`.
     :param mechanism: the linkage.
     :param angles: (4,) initial link angles on the closure [rad].
     :param angle_variance: of phi_a and phi_b at the start [rad^2].
@@ -67,21 +66,27 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self._scratch = np.empty((6, STATE_SIZE))
         self._state = np.zeros(STATE_SIZE)
         self.angles = np.array(angles)
-        self.gamma = np.eye(2)
+        self._to_links = np.vstack([np.eye(2), np.eye(2)])
         self._refresh_gamma()
         self.x = np.array([angles[0], angles[1], 0.0, 0.0])
         self.P = np.diag([angle_variance, angle_variance, rate_variance, rate_variance])
 
     @property
+    def gamma(self) -> Array:
+        """Return Gamma in use (2, 2): (omega_c, omega_d) = Gamma (omega_a, omega_b)."""
+        return self._to_links[2:]
+
+    @property
     def rates(self) -> Array:
         """Return the rates of all four links (4,) [rad/s]."""
-        return np.concatenate([self.x[2:], self.gamma @ self.x[2:]])
+        rates: Array = self._to_links @ self.x[2:]
+        return rates
 
     def sigmas(self) -> tuple[Array, Array]:
         """Return one standard deviation of the four angles [rad] and rates [rad/s]: two (4,)."""
-        to_links = np.vstack([np.eye(2), self.gamma])
-        angles = np.einsum('ij,jk,ik->i', to_links, self.P[:2, :2], to_links)
-        rates = np.einsum('ij,jk,ik->i', to_links, self.P[2:, 2:], to_links)
+        to_links = self._to_links
+        angles = ((to_links @ self.P[:2, :2]) * to_links).sum(axis=1)
+        rates = ((to_links @ self.P[2:, 2:]) * to_links).sum(axis=1)
         return np.sqrt(angles), np.sqrt(rates)
 
     def move(self, duration: float, wheel_torques: Array) -> None:
@@ -117,13 +122,12 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         """
         rows = list(links)
         jacobian = np.zeros((len(rows), 4))
-        jacobian[:, :2] = np.vstack([np.eye(2), self.gamma])[rows]
+        jacobian[:, :2] = self._to_links[rows]
         before = self.x[:2].copy()
         self.update(
             measured, lambda x: jacobian, lambda x: self.angles[rows],
             R=variance * np.eye(len(rows)), residual=lambda z, h: wrap_angles(z - h))
-        change = self.x[:2] - before
-        self._state[LINK_ANGLES] = self.angles + np.concatenate([change, self.gamma @ change])
+        self._state[LINK_ANGLES] = self.angles + self._to_links @ (self.x[:2] - before)
         self._state[LINK_RATES] = self.rates
         project_onto_closure(
             self._state[LINK_ANGLES], self._state[LINK_RATES], self._constants)
@@ -132,7 +136,7 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
 
     def _refresh_gamma(self) -> None:
         if abs(np.sin(self.angles[3] - self.angles[2])) > GAMMA_IS_LOST:
-            self.gamma = gamma_matrix(self.angles, self._constants.lengths)
+            self._to_links[2:] = gamma_matrix(self.angles, self._constants.lengths)
 
 
 @kernel

@@ -31,6 +31,8 @@ def wrap(angle: float) -> float:
 def wrap_angles(angles: ArrayLike) -> Array:
     """Bring angles [rad] of any shape into (-pi, pi]; what is there already stays bit for bit."""
     given = np.asarray(angles, dtype=float)
+    if (np.abs(given) < pi).all():
+        return given
     wrapped = pi - (pi - given) % (2.0 * pi)
     inside = (given > -pi) & (given <= pi)
     return np.where(inside, given, np.where(wrapped <= -pi, pi, wrapped))

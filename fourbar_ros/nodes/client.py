@@ -41,7 +41,7 @@ class TestbedClient:
         self.runtime.executor.add_node(self.node)
         self.statuses = {}
         self.joints = {}
-        self._followed = set()
+        self._followed = {}
         self._setpoints = None
 
     def __enter__(self):
@@ -83,8 +83,7 @@ class TestbedClient:
             return on_status
         for topic in topics:
             if topic not in self._followed:
-                self._followed.add(topic)
-                self.node.create_subscription(
+                self._followed[topic] = self.node.create_subscription(
                     DiagnosticStatus, topic, self.runtime.guard(keep(topic)), LATCHED)
 
     def follow_joints(self, *topics):
@@ -95,9 +94,13 @@ class TestbedClient:
             return on_joints
         for topic in topics:
             if topic not in self._followed:
-                self._followed.add(topic)
-                self.node.create_subscription(
+                self._followed[topic] = self.node.create_subscription(
                     JointState, topic, self.runtime.guard(keep(topic)), SENSOR)
+
+    def leave_joints(self, *topics):
+        """Follow these topics no longer; what was last heard stays in `joints`."""
+        for topic in topics:
+            self.node.destroy_subscription(self._followed.pop(topic))
 
     def stamp_ns(self, topic='flywheel_states'):
         """Return the newest stamp of a followed topic [ns], None before the first."""

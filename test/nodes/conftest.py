@@ -253,6 +253,12 @@ class Probe:
             self._executor.spin_once(timeout_sec=0.02)
         return result
 
+    def catch_up(self):
+        """Handle everything that has arrived by now."""
+        # The executor serves in the order of arrival.
+        task = self._executor.create_task(lambda: None)
+        self.wait(task.done)
+
     def follow(self, *topics, kind=JointState, qos=DEEP):
         """Collect what comes on some topics, and return the list of (the last of) them."""
         for topic in topics:
@@ -266,7 +272,8 @@ class Probe:
         return self.wait(lambda: self.received[topic])[-1]
 
     def more(self, topic, count=1):
-        """Wait for more messages of a followed topic, and return exactly so many."""
+        """Wait for more messages of a followed topic from now on, and return exactly so many."""
+        self.catch_up()
         messages = self.received[topic]
         begin = len(messages)
         self.wait(lambda: len(messages) >= begin + count)
@@ -281,6 +288,7 @@ class Probe:
     def diagnosis(self, node, condition=lambda status: True):
         """Wait for a new status of a node on /diagnostics that fulfils a condition."""
         arrays = self.follow('/diagnostics', kind=DiagnosticArray)
+        self.catch_up()
         begin = len(arrays)
 
         def found():

@@ -1,0 +1,269 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The filter predicts the linkage, and its covariance is that of its errors."""
+
+from dataclasses import dataclass, replace
+
+from fourbar_ros.estimation.filter import LinkageFilter
+from fourbar_ros.mechanism import assemble, Mechanism, nearest_assembly, reduced_form
+from fourbar_ros.mechanism.motion import advance_state, STATE_SIZE
+from fourbar_ros.plant import InitialState, Plant, Table
+from fourbar_ros.plant.table import LinkSensors, WheelEncoders
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+from scipy import stats
+from scipy.integrate import solve_ivp
+
+Array = NDArray[np.float64]
+
+PERIOD = 4e-3
+ALL = (0, 1, 2, 3)
+NOISE = 1.75e-3
+DISTURBANCE = 1e-6
+START_RATE = 0.05
+RUNS, TICKS = 40, 150
+BOUNDS = 0.95
+
+
+# The model
+
+def independent_end(mechanism: Mechanism, start: Array, guess: Array, torques: Array,
+                    duration: float) -> Array:
+    """
+    Integrate (phi_a, phi_b, omega_a, omega_b) with scipy and the reduced form, paper eq. 6.
+
+    With tau = If (alpha + dOmega/dt) the wheels' inertia joins that of the links.
+    """
+    locked = replace(
+        mechanism, link_inertias=mechanism.link_inertias + mechanism.flywheel_inertias)
+
+    def derivative(_: float, x: Array) -> Array:
+        angles = nearest_assembly(mechanism, (0, 1), (x[0], x[1]), guess)
+        form = reduced_form(locked, angles, x[2:])
+        force = -form.wheel_map @ torques - form.bias
+        return np.concatenate([x[2:], np.linalg.solve(form.mass_matrix, force)])
+    solution = solve_ivp(
+        derivative, (0.0, duration), start, method='DOP853', rtol=1e-12, atol=1e-13)
+    end: Array = solution.y[:, -1]
+    return end
+
+
+@pytest.mark.parametrize('branch', ['open', 'crossed'])
+@pytest.mark.parametrize('duration', [1e-3, 2e-2])
+def test_prediction_and_transition_are_those_of_the_linkage(
+    mechanism: Mechanism, branch: str, duration: float,
+) -> None:
+    angles = assemble(mechanism, 0.4, 1.7, branch)
+    torques = np.array([3e-5, -2e-5, 1e-5, 4e-5])
+    start = np.array([0.4, 1.7, 2.0, -1.5])
+    linkage = LinkageFilter(mechanism, angles, 1e-6, 1e-4, 0.0)
+    linkage.x = start.copy()
+    linkage.move(duration, torques)
+    # One step of order four: (3 rad/s * 0.02 s)^5 / 120 = 6e-9, times the few units of Gamma's
+    # derivatives; for the short step rounding.
+    model = 6e-8 * (duration / 2e-2) ** 5 + 1e-14
+    end = independent_end(mechanism, start, angles, torques, duration)
+    np.testing.assert_allclose(linkage.x, end, rtol=0.0, atol=max(model, 1e-11))
+    # Central differences of both sides: 1e-12 of the integrator over 2e-4 here, 2e-16 over 2e-6
+    # there, and a third derivative times 1e-8 / 6.
+    width = 1e-4
+    transition = np.empty((4, 4))
+    for column in range(4):
+        ends = [independent_end(mechanism, start + sign * width * np.eye(4)[column], angles,
+                                torques, duration) for sign in (1.0, -1.0)]
+        transition[:, column] = (ends[0] - ends[1]) / (2.0 * width)
+    np.testing.assert_allclose(linkage.F, transition, rtol=0.0, atol=5e-8 + 10.0 * model)
+
+
+def test_wheel_motion_predicts_the_plant(mechanism: Mechanism) -> None:
+    """Motor torques are nowhere in the filter: what the wheels did tells what the links did."""
+    plant = Plant(mechanism, Table(LinkSensors(0.0, 0), WheelEncoders(0)),
+                  InitialState(0.3, 1.6, 'open', 1.0, -0.5), 5e-4, np.random.default_rng(0))
+    truth = plant.truth()
+    linkage = LinkageFilter(mechanism, truth.link_angles, 1e-6, 1e-4, 0.0)
+    linkage.x = np.concatenate([truth.link_angles[:2], truth.link_rates[:2]])
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        before = plant.truth().wheel_speeds
+        plant.advance(8, rng.uniform(-1e-4, 1e-4, 4))
+        change = plant.truth().wheel_speeds - before
+        linkage.move(PERIOD, mechanism.flywheel_inertias * change / PERIOD)
+    truth = plant.truth()
+    # Momentum is exact at every tick. The wheels' evenness within one is not: alpha changes by
+    # less than 10 rad/s^3 * 4 ms, of which If/I = 2 % counts, over 0.2 s.
+    bound = 10.0 * PERIOD * 0.02 * 0.2
+    np.testing.assert_allclose(linkage.rates, truth.link_rates, rtol=0.0, atol=bound)
+    np.testing.assert_allclose(linkage.angles, truth.link_angles, rtol=0.0, atol=bound * 0.2)
+
+
+# Consistency
+
+@dataclass
+class Consistency:
+    """Errors (runs, ticks, 4), their NEES and NIS (runs, ticks), white innovations, sigmas."""
+
+    errors: Array
+    nees: Array
+    nis: Array
+    whitened: Array
+    link_errors: Array
+    sigmas: Array
+
+
+def monte_carlo(mechanism: Mechanism, seed: int) -> Consistency:
+    """
+    Run the filter on exactly the world that it assumes.
+
+    White torques on each link, white noise on four angles, a start drawn from its covariance.
+    """
+    rng = np.random.default_rng(seed)
+    shape = (RUNS, TICKS)
+    errors, nees = np.empty((*shape, 4)), np.empty(shape)
+    nis, whitened = np.empty(shape), np.empty((*shape, 4))
+    link_errors, sigmas = np.empty((*shape, 8)), np.empty((*shape, 8))
+    constants = mechanism.constants_with_locked_wheels
+    scratch = np.empty((6, STATE_SIZE))
+    for run in range(RUNS):
+        angles = assemble(mechanism, 0.2, 1.5)
+        linkage = LinkageFilter(mechanism, angles, NOISE ** 2, START_RATE ** 2, DISTURBANCE)
+        start = linkage.x + rng.standard_normal(4) * np.sqrt(np.diag(linkage.P))
+        state = np.zeros(STATE_SIZE)
+        state[:4] = nearest_assembly(mechanism, (0, 1), (start[0], start[1]), angles)
+        gamma = reduced_form(mechanism, state[:4], start[2:]).gamma
+        state[4:8] = np.concatenate([start[2:], gamma @ start[2:]])
+        for tick in range(TICKS):
+            wheels = 2e-5 * np.sin(0.1 * tick + np.arange(4))
+            # White torque in two pieces per period; the filter takes it as continuous.
+            for _ in range(2):
+                disturbed = wheels + DISTURBANCE / np.sqrt(PERIOD / 2) * rng.standard_normal(4)
+                advance_state(
+                    state, disturbed, disturbed, disturbed, PERIOD / 2, constants, scratch)
+            linkage.move(PERIOD, wheels)
+            innovation, nis[run, tick] = linkage.correct(
+                ALL, state[:4] + NOISE * rng.standard_normal(4), NOISE ** 2)
+            whitened[run, tick] = np.linalg.solve(np.linalg.cholesky(linkage.S), innovation)
+            error = linkage.x - state[[0, 1, 4, 5]]
+            errors[run, tick] = error
+            nees[run, tick] = error @ np.linalg.solve(linkage.P, error)
+            link_errors[run, tick] = np.concatenate(
+                [linkage.angles - state[:4], linkage.rates - state[4:8]])
+            sigmas[run, tick] = np.concatenate(linkage.sigmas())
+    return Consistency(errors, nees, nis, whitened, link_errors, sigmas)
+
+
+@pytest.fixture(scope='module', params=['paper', 'uneven'])
+def consistency(request: pytest.FixtureRequest) -> Consistency:
+    """Run the Monte Carlo once per linkage, seed 11."""
+    return monte_carlo(request.getfixturevalue(request.param), seed=11)
+
+
+def chi_square_mean(freedom: int, count: int) -> tuple[float, float]:
+    """Bound the mean of `count` chi-square numbers."""
+    low, high = stats.chi2.interval(BOUNDS, freedom * count)
+    return low / count, high / count
+
+
+def test_nis_is_chi_square_of_four(consistency: Consistency) -> None:
+    low, high = chi_square_mean(4, RUNS * TICKS)
+    assert low < consistency.nis.mean() < high
+
+
+@pytest.mark.parametrize('tick', [0, TICKS // 3, TICKS - 1])
+def test_nees_is_chi_square_of_four(tick: int, consistency: Consistency) -> None:
+    """Runs are independent, ticks are not: the bounds hold for one tick over all runs."""
+    low, high = chi_square_mean(4, RUNS)
+    assert low < consistency.nees[:, tick].mean() < high
+
+
+def test_estimates_are_without_bias(consistency: Consistency) -> None:
+    last = consistency.errors[:, -1]
+    mean = last.mean(axis=0) / (last.std(axis=0, ddof=1) / np.sqrt(RUNS))
+    # Four components share the 5 %.
+    assert np.abs(mean).max() < stats.t.ppf(1.0 - 0.05 / 8.0, RUNS - 1)
+
+
+def test_innovations_are_white(consistency: Consistency) -> None:
+    """Whitened innovations of one tick do not tell those of the next ten, in any pair of links."""
+    lags = range(1, 11)
+    bound = stats.norm.ppf(1.0 - 0.05 / 2.0 / (16 * len(lags)))
+    white = consistency.whitened
+    for lag in lags:
+        later, earlier = white[:, lag:].reshape(-1, 4), white[:, :-lag].reshape(-1, 4)
+        correlations = later.T @ earlier / np.sqrt(len(later))
+        assert np.abs(correlations).max() < bound, f'lag {lag}'
+
+
+def test_sigmas_of_all_four_links_are_those_of_their_errors(consistency: Consistency) -> None:
+    """For c and d, which follow by closure, as well as for a and b."""
+    # Eight numbers share the 5 %, hence the wider interval.
+    low, high = (bound / RUNS for bound in stats.chi2.interval(1.0 - 0.05 / 8.0, RUNS))
+    ratio = ((consistency.link_errors[:, -1] / consistency.sigmas[:, -1]) ** 2).mean(axis=0)
+    assert (ratio > low).all()
+    assert (ratio < high).all()
+
+
+def test_measuring_makes_the_filter_surer(consistency: Consistency) -> None:
+    angle, rate = consistency.sigmas[:, -1, :2], consistency.sigmas[:, -1, 4:6]
+    assert (angle < NOISE / 2.0).all()
+    assert (rate < START_RATE / 2.0).all()
+
+
+# Single corrections
+
+def test_sigma_of_a_parallel_link_is_that_of_its_partner(paper: Mechanism) -> None:
+    linkage = LinkageFilter(paper, assemble(paper, 0.2, 1.5), 4e-6, 1e-2, 1e-7)
+    linkage.P[1, 1], linkage.P[3, 3] = 9e-6, 4e-2
+    angles, rates = linkage.sigmas()
+    np.testing.assert_allclose(angles, [2e-3, 3e-3, 2e-3, 3e-3], rtol=1e-12)
+    np.testing.assert_allclose(rates, [0.1, 0.2, 0.1, 0.2], rtol=1e-12)
+
+
+def test_sigma_follows_gamma(uneven: Mechanism) -> None:
+    """Error propagation through the closure, by finite differences of the assembly."""
+    angles = assemble(uneven, 0.2, 1.5)
+    linkage = LinkageFilter(uneven, angles, 4e-6, 1e-2, 1e-7)
+    linkage.P[0, 1] = linkage.P[1, 0] = 1e-6
+    slopes = np.array([
+        (nearest_assembly(uneven, (0, 1), (0.2 + da, 1.5 + db), angles)
+         - nearest_assembly(uneven, (0, 1), (0.2 - da, 1.5 - db), angles)) / 2e-5
+        for da, db in ((1e-5, 0.0), (0.0, 1e-5))])
+    variances = np.einsum('ji,jk,ki->i', slopes, linkage.P[:2, :2], slopes)
+    # Differences of 1e-5: 1e-16 / 1e-5 of rounding, 1e-10 of curvature.
+    np.testing.assert_allclose(linkage.sigmas()[0], np.sqrt(variances), rtol=1e-8)
+
+
+@pytest.mark.parametrize('turns', [-3, -1, 1, 50])
+def test_turn_of_a_measurement_does_not_matter(turns: int, mechanism: Mechanism) -> None:
+    angles = assemble(mechanism, 0.2, 1.5)
+    measured = angles + [1e-3, -1e-3, 2e-3, 0.0]
+    ends = []
+    for offset in (0.0, 2.0 * np.pi * turns):
+        linkage = LinkageFilter(mechanism, angles, 1e-6, 1e-4, 1e-7)
+        linkage.correct(ALL, measured + offset, 1e-6)
+        ends.append(linkage.angles)
+    # 50 turns have a rounding of 6e-14.
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=1e-12)
+
+
+def test_measured_link_tells_its_partner(paper: Mechanism) -> None:
+    """A link that never gives a sample is known through the closure."""
+    angles = assemble(paper, 0.2, 1.5)
+    target = assemble(paper, 0.25, 1.45)
+    linkage = LinkageFilter(paper, angles, 1e-2, 1e-4, 1e-7)
+    for _ in range(100):
+        linkage.correct((2, 3), target[2:], 1e-6)
+    # What the prior of 0.1 rad still weighs after a hundred samples of 1 mrad: 1e-6 of 0.05 rad.
+    np.testing.assert_allclose(linkage.angles, target, rtol=0.0, atol=1e-7)
