@@ -118,7 +118,7 @@ class Testbed:
         try:
             samples = self.device.step(stamp_ns, self._driving_torques())
         except FourbarError as error:
-            self._torques[:] = 0.0
+            self._parked_speeds = None
             self.gate.fail(stamp_ns, str(error))
             raise
         self._tick_ns = stamp_ns

@@ -406,3 +406,9 @@ def make_probe(domain):
 def probe(make_probe):
     """Watch the module's nodes."""
     return make_probe()
+
+
+@pytest.fixture(scope='session')
+def no_shared_memory():
+    """Return the environment for a process that will be killed."""
+    return NO_SHARED_MEMORY

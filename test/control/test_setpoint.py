@@ -1,0 +1,251 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A setpoint means what it names, or is refused with the name or number that speaks against it."""
+
+from collections.abc import Callable
+from itertools import combinations
+from math import inf, nan, pi
+from typing import Any
+
+from fourbar_ros.control import SetpointError
+from fourbar_ros.control.setpoint import check_names
+from fourbar_ros.mechanism import (
+    assemble,
+    branch_of,
+    closure_error,
+    ClosureError,
+    LINK_NAMES,
+    Mechanism,
+)
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+Drive = Callable[..., Any]
+PAIRS = list(combinations(range(4), 2))
+
+
+def names_of(*links: int) -> list[str]:
+    return [LINK_NAMES[link] for link in links]
+
+
+def refusal(driven: Any, goals: dict[str, float]) -> str:
+    """Give a setpoint that must be refused, and return why it was."""
+    controller = driven.controller
+    before = controller.mode, controller.goal, controller.accepted, controller.refused
+    with pytest.raises(SetpointError) as caught:
+        controller.setpoint(list(goals), list(goals.values()))
+    assert (controller.mode, controller.goal, controller.accepted) == before[:3]
+    assert controller.refused == before[3] + 1
+    assert controller.last_refusal == str(caught.value)
+    assert '\n' not in str(caught.value)
+    return str(caught.value)
+
+
+def goal_of(driven: Any, goals: dict[str, float]) -> Array:
+    driven.controller.setpoint(list(goals), list(goals.values()))
+    goal: Array = driven.controller.goal
+    return goal
+
+
+# Names
+
+@pytest.mark.parametrize(('names', 'positions', 'needle'), [
+    ([], [], 'no link is named'),
+    (['link_a'], [], '1 names but 0 positions'),
+    (['link_a'], [1.0, 2.0], '1 names but 2 positions'),
+    (['link_a', 'link_x'], [1.0, 2.0], "unknown link 'link_x'"),
+    (['flywheel_a'], [1.0], "unknown link 'flywheel_a'"),
+    (['link_b', 'link_a', 'link_b'], [1.0, 2.0, 3.0], 'link_b is named twice'),
+    (['link_a', 'link_c'], [0.0, nan], 'position of link_c is nan'),
+    (['link_d'], [-inf], 'position of link_d is -inf'),
+])
+def test_names_that_cannot_be_read_are_refused(
+    names: list[str], positions: list[float], needle: str,
+) -> None:
+    with pytest.raises(SetpointError) as caught:
+        check_names(names, positions)
+    assert needle in str(caught.value)
+
+
+def test_names_may_come_in_any_order() -> None:
+    assert check_names(['link_d', 'link_a'], [1.0, 2.0]) == {3: 1.0, 0: 2.0}
+
+
+# Goals
+
+@pytest.mark.parametrize(('link', 'holds'), [(0, 1), (1, 0), (2, 1), (3, 0)])
+@pytest.mark.parametrize('linkage', ['paper', 'uneven'])
+def test_one_link_moves_and_its_neighbour_holds(
+    link: int, holds: int, linkage: str, request: pytest.FixtureRequest, drive: Drive,
+) -> None:
+    mechanism = request.getfixturevalue(linkage)
+    driven = drive(mechanism, 0.2, 1.5)
+    present = driven.angles.copy()
+    goal = goal_of(driven, {LINK_NAMES[link]: present[link] + 0.3})
+    assert goal[link] == pytest.approx(present[link] + 0.3, abs=1e-9)
+    assert goal[holds] == pytest.approx(present[holds], abs=1e-9)
+    assert closure_error(mechanism, goal) < 1e-15
+
+
+@pytest.mark.parametrize('pair', [pair for pair in PAIRS if pair not in ((0, 2), (1, 3))])
+def test_neighbours_determine_the_rhombus(
+    pair: tuple[int, int], drive: Drive, paper: Mechanism,
+) -> None:
+    driven = drive(paper, 0.2, 1.5)
+    wanted = assemble(paper, 0.9, 1.8)
+    goal = goal_of(driven, {LINK_NAMES[link]: float(wanted[link]) for link in pair})
+    np.testing.assert_allclose(goal, wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize('pair', [(0, 2), (1, 3)])
+def test_parallel_links_do_not_determine_the_rhombus(pair: tuple[int, int], drive: Drive) -> None:
+    first, second = names_of(*pair)
+    message = refusal(drive(), {first: 0.7, second: 0.7})
+    assert 'do not determine the configuration' in message
+    assert f'{first} = 0.7' in message
+
+
+@pytest.mark.parametrize('count', [3, 4])
+def test_more_links_than_needed_must_agree(count: int, drive: Drive, uneven: Mechanism) -> None:
+    driven = drive(uneven, 0.2, 1.5)
+    wanted = assemble(uneven, 0.4, 1.8)
+    goals = {LINK_NAMES[link]: float(wanted[link]) for link in range(count)}
+    np.testing.assert_allclose(goal_of(driven, goals), wanted, atol=1e-9)
+    last = LINK_NAMES[count - 1]
+    goals[last] += 0.01
+    message = refusal(driven, goals)
+    assert f'{last} would be at {wanted[count - 1]:.4f} rad' in message
+    assert f'{goals[last]:.4f} rad' in message
+
+
+@pytest.mark.parametrize('turns', [-7, 0, 1, 3])
+@pytest.mark.parametrize('start', [-20.0, 0.0, 3.0])
+@pytest.mark.parametrize('way', [0.1, 3.1, -3.1])
+def test_links_take_the_shortest_way_round(
+    turns: int, start: float, way: float, drive: Drive, paper: Mechanism,
+) -> None:
+    """The whole turns by `way`, whatever turns the present and the named angles are on."""
+    driven = drive(paper, start, start + 1.2)
+    present = driven.angles.copy()
+    goal = goal_of(driven, {
+        'link_a': start + way + 2 * pi * turns, 'link_b': start + 1.2 + way - 2 * pi * turns})
+    np.testing.assert_allclose(goal, present + way, atol=1e-9)
+
+
+def test_moving_links_take_the_shortest_way_from_their_goal(drive: Drive) -> None:
+    """A second setpoint during a move is measured from where the links are told to be."""
+    driven = drive(phi_a=0.0, phi_b=1.2)
+    goal_of(driven, {'link_a': 2.0, 'link_b': 3.2})
+    for _ in range(10):
+        driven.tick()
+    goal = goal_of(driven, {'link_a': 4.0, 'link_b': 5.2})
+    np.testing.assert_allclose(goal[:2], [4.0, 5.2], atol=1e-9)
+
+
+# Refusals
+
+def test_angles_that_cannot_close_are_refused(drive: Drive) -> None:
+    long = Mechanism(  # type: ignore[arg-type]
+        [0.3, 0.3, 0.2, 0.2], [0.02] * 4, [2e-5] * 4, [[0.05, 0.0]] * 4, [3e-7] * 4)
+    message = refusal(drive(long, 0.0, 1.0), {'link_a': 0.0, 'link_b': 2.5})
+    assert 'cannot close' in message
+    assert 'link_b = 2.5000 rad' in message
+    # Sides of 0.2 m reach 0.4 m; links of 0.3 m at 2.5 rad need 0.6 sin(1.25).
+    assert 'to 0.4 m' in message
+    assert '0.569' in message
+
+
+@pytest.mark.parametrize('goal', [0.05, 0.0, -0.5, pi + 0.5, pi - 0.05])
+def test_change_point_on_the_way_is_refused(goal: float, drive: Drive) -> None:
+    message = refusal(drive(phi_b=0.8), {'link_a': 0.0, 'link_b': goal})
+    if goal != 0.0:
+        assert 'change point' in message
+        assert 'limit 0.1' in message
+
+
+@pytest.mark.parametrize('theta', [0.02, 0.05, 0.09, -0.03, pi - 0.05])
+def test_move_away_from_a_change_point_is_allowed(theta: float, drive: Drive) -> None:
+    """Whoever gets too close must be able to leave."""
+    driven = drive(phi_a=0.3, phi_b=0.3 + theta)
+    outward = np.sign(np.sin(theta)) * np.sign(np.cos(theta)) * 0.5
+    goal = goal_of(driven, {'link_b': 0.3 + theta + outward})
+    assert goal[1] == pytest.approx(0.3 + theta + outward, abs=1e-9)
+
+
+@pytest.mark.parametrize('theta', [0.02, 0.05, 0.09])
+def test_hold_close_to_a_change_point_is_no_approach(theta: float, drive: Drive) -> None:
+    """Told to stay where it is, it comes no closer: rounding must not decide."""
+    driven = drive(phi_a=0.3, phi_b=0.3 + theta)
+    np.testing.assert_allclose(
+        goal_of(driven, {'link_a': 0.3, 'link_b': 0.3 + theta}), driven.angles, atol=1e-9)
+
+
+def test_move_closer_to_a_change_point_is_refused(drive: Drive) -> None:
+    driven = drive(phi_a=0.3, phi_b=0.3 + 0.05)
+    assert 'change point' in refusal(driven, {'link_b': 0.3 + 0.04})
+
+
+def test_other_branch_is_refused(drive: Drive, uneven: Mechanism) -> None:
+    """Where c names an assembly that only the other branch has, it is not moved elsewhere."""
+    driven = drive(uneven, 0.2, 1.5)
+    other = assemble(uneven, 0.2, 1.5, 'crossed')
+    message = refusal(driven, {LINK_NAMES[link]: float(other[link]) for link in range(3)})
+    assert 'link_c' in message
+
+
+# What was accepted
+
+def random_linkage(rng: np.random.Generator) -> Mechanism:
+    while True:
+        lengths = rng.uniform(0.05, 0.15, 4)
+        if 2.0 * lengths.max() < 0.95 * lengths.sum():
+            return Mechanism(  # type: ignore[arg-type]
+                lengths, [0.02] * 4, [2e-5] * 4, [[0.05, 0.0]] * 4, [3e-7] * 4)
+
+
+def random_pose(rng: np.random.Generator, mechanism: Mechanism) -> tuple[float, float, str]:
+    while True:
+        phi_a, theta = rng.uniform(-pi, pi), rng.uniform(-pi, pi)
+        branch = str(rng.choice(['open', 'crossed']))
+        try:
+            angles = assemble(mechanism, phi_a, phi_a + theta, branch)
+        except ClosureError:
+            continue
+        if abs(np.sin(angles[3] - angles[2])) > 0.15:
+            return phi_a, phi_a + theta, branch
+
+
+@pytest.mark.parametrize('pair', PAIRS, ids=lambda pair: '-'.join(names_of(*pair)))
+def test_accepted_goal_holds_what_was_named(pair: tuple[int, int], drive: Drive) -> None:
+    """On any linkage, from any pose: both named links are where they were told, and it closes."""
+    accepted = 0
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        mechanism = random_linkage(rng)
+        driven = drive(mechanism, *random_pose(rng, mechanism))
+        present = driven.angles.copy()
+        named = {link: float(present[link] + rng.uniform(-0.8, 0.8)) for link in pair}
+        try:
+            goal = goal_of(driven, {LINK_NAMES[link]: angle for link, angle in named.items()})
+        except SetpointError:
+            continue
+        accepted += 1
+        assert closure_error(mechanism, goal) < 1e-14, f'seed {seed}'
+        assert branch_of(goal) == branch_of(present), f'seed {seed}'
+        for link, angle in named.items():
+            assert goal[link] == pytest.approx(angle, abs=1e-9), f'seed {seed}, {LINK_NAMES[link]}'
+    assert accepted > 20
