@@ -59,10 +59,10 @@ TABLE = (
 )
 
 # Times [s]: to look for another plant, for everything to come up, to settle before and after.
-LOOK_AROUND = 1.0
+LOOK_AROUND = 0.7
 START_UP = 30.0
-SETTLE_BEFORE = 1.0
-SETTLE_AFTER = 1.6
+SETTLE_BEFORE = 0.5
+SETTLE_AFTER = 1.2
 
 EPILOG = """\
 Uses the ROS_DOMAIN_ID of the environment (default 0) with discovery on this machine alone.

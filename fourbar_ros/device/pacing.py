@@ -37,16 +37,25 @@ class RealtimePace:
         self._patience_ns = patience_ns
         self._next_ns = system_ns
 
-    def due(self, steady_ns: int) -> list[int]:
-        """Return the stamps of the ticks that are due now, oldest first [ns]."""
-        now_ns = steady_ns + self._offset_ns
-        behind_ns = now_ns - self._next_ns
-        if behind_ns < 0:
-            return []
+    def is_due(self, steady_ns: int) -> bool:
+        """Tell whether there is a tick to make."""
+        return steady_ns + self._offset_ns >= self._next_ns
+
+    def due(self, steady_ns: int) -> int | None:
+        """
+        Take the oldest tick that is due.
+
+        One at a time, so that commands get their turn between two ticks that are both late.
+
+        :returns: its stamp [ns], None if no tick is due.
+        """
+        if not self.is_due(steady_ns):
+            return None
+        behind_ns = steady_ns + self._offset_ns - self._next_ns
         if behind_ns > self._patience_ns:
             missed = behind_ns // self._period_ns
             self.skipped += missed
             self._next_ns += missed * self._period_ns
-        stamps = list(range(self._next_ns, now_ns + 1, self._period_ns))
-        self._next_ns = stamps[-1] + self._period_ns
-        return stamps
+        stamp_ns = self._next_ns
+        self._next_ns += self._period_ns
+        return stamp_ns

@@ -16,20 +16,18 @@
 
 from __future__ import annotations
 
+from threading import Timer
+
 from fourbar_ros.control import Controller, ControllerSettings
 from fourbar_ros.device import SimulatedTable, Testbed, TestbedSettings
 from fourbar_ros.estimation import Estimator, EstimatorSettings
 from fourbar_ros.loop.closed_loop import ClosedLoop
 from fourbar_ros.mechanism import load_mechanism
-from fourbar_ros.mechanism.compiled import cache_directory
 from fourbar_ros.plant import InitialState, load_table, Plant
 import numpy as np
 
-
-def is_cold() -> bool:
-    """Tell whether the kernels are still to be compiled, which takes some ten seconds."""
-    directory = cache_directory()
-    return directory is None or not any(directory.rglob('*linearise*.nbi'))
+# Loading compiled code takes less than this [s].
+NOTICE_AFTER = 1.0
 
 
 def warm_up() -> None:
@@ -44,10 +42,12 @@ def warm_up() -> None:
 
 
 def main() -> None:
-    """Compile, and say so if it takes a while."""
-    if is_cold():
-        print('Compiling the kernels, once (about 10 s)', flush=True)
+    """Compile, and say so if there is something to compile."""
+    notice = Timer(NOTICE_AFTER, print, ['Compiling the kernels, once (about 10 s)'],
+                   {'flush': True})
+    notice.start()
     warm_up()
+    notice.cancel()
 
 
 if __name__ == '__main__':

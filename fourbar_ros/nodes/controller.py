@@ -28,6 +28,7 @@ from fourbar_ros.nodes.messages import (
     SENSOR,
     stamp_of,
     status_message,
+    TABLE_FRAME,
     WARN,
 )
 from fourbar_ros.nodes.parameters import declare, Parameter
@@ -66,7 +67,8 @@ class ControllerNode(Node):
 
         self._command = JointStatePublisher(
             self, 'flywheel_command', FLYWHEEL_NAMES, ('effort',))
-        self._reference = JointStatePublisher(self, 'reference', LINK_NAMES)
+        self._reference = JointStatePublisher(
+            self, 'reference', LINK_NAMES, frame=TABLE_FRAME)
         self._error = JointStatePublisher(self, 'tracking_error', LINK_NAMES)
         self._energy = JointStatePublisher(self, 'energy', SCALARS, ('position',))
         self._status = self.create_publisher(DiagnosticStatus, 'controller_status', LATCHED)

@@ -33,6 +33,8 @@ from fourbar_ros.nodes.messages import (
     RELIABLE,
     stamp_of,
     status_message,
+    steady_ns,
+    TABLE_FRAME,
     WARN,
 )
 from fourbar_ros.nodes.parameters import declare, Parameter
@@ -76,9 +78,9 @@ class DeviceNode(Node):
         self._testbed = Testbed(make_device(values, period_ns), TestbedSettings(
             values['command_timeout'], values['sensor_timeout'], values['timeout_action']))
         self._log = RareLog(self)
-        self._announced = None
 
-        self._links = JointStatePublisher(self, 'link_angles', LINK_NAMES, ('position',))
+        self._links = JointStatePublisher(
+            self, 'link_angles', LINK_NAMES, ('position',), frame=TABLE_FRAME)
         self._wheels = JointStatePublisher(
             self, 'flywheel_states', FLYWHEEL_NAMES, ('position', 'velocity', 'effort'))
         self._timing = JointStatePublisher(self, 'timing', TIMING_NAMES, ('position',))
@@ -88,10 +90,14 @@ class DeviceNode(Node):
         GateServices(self, self._testbed, guard, self._announce)
         device = self._testbed.device
         self._diagnostics = Diagnostics(self, device.description, self._collect, guard)
-        self._pace = RealtimePace(time.time_ns(), time.monotonic_ns(), period_ns, PATIENCE_NS)
-        self._announce()
-        self.create_timer(period_ns * 1e-9, guard(self._on_timer),
+        self._announced = None
+        self._catching_up = False
+        self._soon = lambda callback: runtime.executor.create_task(guard(callback))
+        # One after the other, so that the timer fires right after a tick is due.
+        self._pace = RealtimePace(time.time_ns(), steady_ns(), period_ns, PATIENCE_NS)
+        self.create_timer((period_ns + 0.5) * 1e-9, guard(self._on_timer),  # rclpy rounds down
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._announce()
         self.get_logger().info(
             f'{device.description} with mechanism {self._mechanism} at {values["rate"]:g} Hz')
 
@@ -104,26 +110,34 @@ class DeviceNode(Node):
         self._announce()
 
     def _on_timer(self):
-        for stamp_ns in self._pace.due(time.monotonic_ns()):
-            if self._testbed.gate.state is not DeviceState.FAULT:
-                self._tick(stamp_ns)
+        if not self._catching_up:
+            self._advance()
+
+    def _advance(self):
+        """Make one tick that is due; the next one, if it is late too, after waiting commands."""
+        stamp_ns = self._pace.due(steady_ns())
+        if stamp_ns is not None and self._testbed.gate.state is not DeviceState.FAULT:
+            self._tick(stamp_ns)
         self._announce()
+        self._catching_up = self._pace.is_due(steady_ns())
+        if self._catching_up:
+            self._soon(self._advance)
 
     def _tick(self, stamp_ns):
-        begin_ns = time.monotonic_ns()
+        begin_ns = steady_ns()
         try:
             samples, timing = self._testbed.tick(stamp_ns, begin_ns)
         except FourbarError as error:
             self.get_logger().error(f'{error}: the device stands still')
             return
-        step_ns = time.monotonic_ns() - begin_ns
+        step_ns = steady_ns() - begin_ns
         for sample in samples.links:
             self._links.publish(sample.stamp_ns, sample.angles,
                                 names=tuple(LINK_NAMES[link] for link in sample.links))
         wheels = samples.wheels
         # The tick, after everything that belongs to it.
         self._wheels.publish(stamp_ns, wheels.angles, wheels.speeds, wheels.efforts)
-        self._testbed.published(time.monotonic_ns(), step_ns)
+        self._testbed.published(steady_ns(), step_ns)
         scalars = {name: getattr(timing, name) for name in TIMING_NAMES}
         known = tuple(name for name in TIMING_NAMES if scalars[name] is not None)
         self._timing.publish(stamp_ns, [scalars[name] for name in known], names=known)
@@ -134,7 +148,7 @@ class DeviceNode(Node):
         clipped = self._testbed.clipped
         try:
             self._testbed.command(stamp_of(message), message.name, message.position,
-                                  message.velocity, message.effort, time.monotonic_ns())
+                                  message.velocity, message.effort, steady_ns())
         except CommandError as error:
             self._log.warn(f'flywheel_command rejected: {error}')
         if self._testbed.clipped > clipped:

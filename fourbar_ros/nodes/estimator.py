@@ -24,6 +24,7 @@ from fourbar_ros.nodes.messages import (
     RareLog,
     SENSOR,
     stamp_of,
+    TABLE_FRAME,
     WARN,
 )
 from fourbar_ros.nodes.parameters import declare, Parameter
@@ -52,7 +53,8 @@ class EstimatorNode(Node):
         self._estimator = Estimator(
             load_mechanism(values.pop('mechanism')), EstimatorSettings(**values))
         self._log = RareLog(self)
-        self._states = JointStatePublisher(self, 'estimate/link_states', LINK_NAMES)
+        self._states = JointStatePublisher(
+            self, 'estimate/link_states', LINK_NAMES, frame=TABLE_FRAME)
         self._sigma = JointStatePublisher(self, 'estimate/sigma', LINK_NAMES)
         self._innovation = JointStatePublisher(
             self, 'estimate/innovation', ('nis', 'degrees_of_freedom', *LINK_NAMES),

@@ -14,9 +14,7 @@
 
 """The arming gate of a testbed as services, and the topic that stops it."""
 
-import time
-
-from fourbar_ros.nodes.messages import RELIABLE
+from fourbar_ros.nodes.messages import RELIABLE, steady_ns
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
@@ -44,7 +42,7 @@ class GateServices:
     def _on_arm(self, request, response):
         if request.data:
             response.success, response.message = self._testbed.arm(
-                time.monotonic_ns(), self._obstacles())
+                steady_ns(), self._obstacles())
         else:
             self._testbed.disarm('disarmed on request')
             response.success = True

@@ -14,6 +14,8 @@
 
 """Quality of service, and messages that are made once and written in place."""
 
+import time
+
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 from rclpy.clock import Clock, ClockType
@@ -25,10 +27,22 @@ RELIABLE = QoSProfile(depth=10)
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
+TABLE_FRAME = 'table'
+
 # A message on a wrong input at most so often [s].
 LOG_PERIOD = 1.0
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+def steady_ns():
+    """
+    Read the clock that nobody can set [ns].
+
+    The very one that timers run on (rcutils): Python's monotonic clock is disciplined by NTP and
+    would slowly slide past it.
+    """
+    return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
 
 
 def stamp_of(message):
@@ -42,12 +56,14 @@ class JointStatePublisher:
     Publish a JointState with the same names every time, reusing one message.
 
     :param fields: those of position, velocity, effort that are used; the others stay empty.
+    :param frame: in which orientations are given.
     """
 
-    def __init__(self, node, topic, names, fields=('position', 'velocity')):
+    def __init__(self, node, topic, names, fields=('position', 'velocity'), frame=''):
         self._publisher = node.create_publisher(JointState, topic, RELIABLE)
         self._fields = fields
         self._message = JointState()
+        self._message.header.frame_id = frame
         self._set_names(tuple(names))
 
     def _set_names(self, names):
@@ -117,13 +133,12 @@ class RareLog:
 
     def __init__(self, node):
         self._logger = node.get_logger()
-        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._last_ns = None
         self._held = 0
 
     def warn(self, message):
         """Log, or count as held back."""
-        now_ns = self._clock.now().nanoseconds
+        now_ns = steady_ns()
         if self._last_ns is not None and now_ns - self._last_ns < LOG_PERIOD * 1e9:
             self._held += 1
             return

@@ -20,7 +20,7 @@ from fourbar_ros.device import SimulatedTable
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism
 from fourbar_ros.mechanism.closure import BRANCHES
 from fourbar_ros.nodes import device_node
-from fourbar_ros.nodes.messages import JointStatePublisher
+from fourbar_ros.nodes.messages import JointStatePublisher, TABLE_FRAME
 from fourbar_ros.nodes.parameters import Parameter
 from fourbar_ros.nodes.runtime import run_node
 from fourbar_ros.plant import InitialState, load_table, Plant
@@ -50,7 +50,8 @@ class PlantNode(device_node.DeviceNode):
 
     def __init__(self, runtime):
         super().__init__(runtime, 'plant', OWN_PARAMETERS, make_device)
-        self._true_links = JointStatePublisher(self, 'sim/link_states', LINK_NAMES)
+        self._true_links = JointStatePublisher(
+            self, 'sim/link_states', LINK_NAMES, frame=TABLE_FRAME)
         self._true_wheels = JointStatePublisher(
             self, 'sim/flywheel_states', FLYWHEEL_NAMES, ('position', 'velocity', 'effort'))
 

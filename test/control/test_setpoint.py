@@ -187,11 +187,15 @@ def test_move_away_from_a_change_point_is_allowed(theta: float, drive: Drive) ->
 
 
 @pytest.mark.parametrize('theta', [0.02, 0.05, 0.09])
-def test_hold_close_to_a_change_point_is_no_approach(theta: float, drive: Drive) -> None:
-    """Told to stay where it is, it comes no closer: rounding must not decide."""
+@pytest.mark.parametrize('turn', [0.0, 1.0])
+def test_keeping_the_distance_to_a_change_point_is_no_approach(
+    theta: float, turn: float, drive: Drive,
+) -> None:
+    """Told to stay, or to turn as a whole, it comes no closer: rounding is no reason."""
     driven = drive(phi_a=0.3, phi_b=0.3 + theta)
     np.testing.assert_allclose(
-        goal_of(driven, {'link_a': 0.3, 'link_b': 0.3 + theta}), driven.angles, atol=1e-9)
+        goal_of(driven, {'link_a': 0.3 + turn, 'link_b': 0.3 + turn + theta}),
+        driven.angles + turn, atol=1e-9)
 
 
 def test_move_closer_to_a_change_point_is_refused(drive: Drive) -> None:

