@@ -59,7 +59,7 @@ TABLE = (
 )
 
 # Times [s]: to look for another plant, for everything to come up, to settle before and after.
-LOOK_AROUND = 0.7
+LOOK_AROUND = 0.5
 START_UP = 30.0
 SETTLE_BEFORE = 0.5
 SETTLE_AFTER = 1.2
@@ -95,11 +95,12 @@ def run(args: argparse.Namespace) -> int:
     from fourbar_ros.nodes.client import TestbedClient
 
     with TestbedClient() as testbed, ExitStack() as stack:
+        # Once here, or three nodes would do it side by side; meanwhile others are discovered.
+        compile_kernels()
+        import fourbar_ros.analysis.figures  # noqa: F401
         _refuse_second_plant(testbed)
         stack.enter_context(_locked(args.output))
         _prepare(args.output)
-        # Once here, or three nodes would do it side by side.
-        compile_kernels()
         with Processes(args.output / 'logs', os.environ) as processes:
             _move(testbed, processes, args.output / 'bag', progress_bar)
     print('Writing the report')
@@ -208,8 +209,9 @@ def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> N
             return bool(elapsed >= duration)
         until(arrived, 'the motion did not end', 3.0 * duration)
     testbed.arm(False)
-    for name in ('controller', 'estimator', 'plant', 'record'):
-        processes.stop(name)
+    processes.stop('controller')
+    processes.stop('estimator', 'plant')
+    processes.stop('record')
 
 
 def _armed(testbed: Any) -> bool:

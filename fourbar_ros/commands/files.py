@@ -35,8 +35,11 @@ def write_whole(path: Path) -> Iterator[TextIO]:
     """
     Open a text file that appears under its name only once it is complete.
 
-    :raises OutputError: the folder is missing or not writable, or the disk is full.
+    :raises OutputError: the folder is missing or not writable, the disk is full, or the path is
+        a folder, a pipe or a device.
     """
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise OutputError(f'cannot write {path}: it is not a regular file')
     name = ''
     try:
         with tempfile.NamedTemporaryFile(

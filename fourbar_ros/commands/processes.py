@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 import ctypes
 from pathlib import Path
 import signal
@@ -85,16 +86,17 @@ class Processes:
             if code is not None:
                 raise ProcessError(f'{name} ended with exit code {code}: {self._last_line(name)}')
 
-    def stop(self, name: str) -> None:
-        """Ask one to end, insist if it does not, and wait until it has."""
-        process = self._running.pop(name)
+    def stop(self, *names: str) -> None:
+        """Ask some to end, insist if they do not, and wait until they have."""
+        processes = [self._running.pop(name) for name in names]
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-            if process.poll() is None:
-                process.send_signal(number)
-                try:
-                    process.wait(PATIENCE)
-                except subprocess.TimeoutExpired:
-                    continue
+            for process in processes:
+                if process.poll() is None:
+                    process.send_signal(number)
+            deadline = time.monotonic() + PATIENCE
+            for process in processes:
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(max(0.0, deadline - time.monotonic()))
 
     def _last_line(self, name: str) -> str:
         time.sleep(0.05)    # its last words may still be on their way

@@ -22,8 +22,6 @@ import time
 
 from fourbar_ros.errors import FourbarError
 
-HELP = 'record topics into a rosbag2 directory (MCAP), until Ctrl-C'
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""

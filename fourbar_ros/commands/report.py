@@ -24,8 +24,6 @@ from typing import Any
 
 from fourbar_ros.errors import FourbarError
 
-HELP = 'turn a bag into an HTML report and metrics'
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""

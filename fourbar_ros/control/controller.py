@@ -22,7 +22,7 @@ from math import pi, sin
 
 from fourbar_ros.control.allocation import minimum_norm
 from fourbar_ros.control.reference import SoftStep
-from fourbar_ros.control.setpoint import check_move, check_names, resolve, SetpointError
+from fourbar_ros.control.setpoint import check_names, plan, SetpointError
 from fourbar_ros.mechanism import Mechanism, nearest_assembly
 from fourbar_ros.mechanism.dynamics import gamma_matrix, reduced_form
 from fourbar_ros.mechanism.parameters import Array
@@ -176,14 +176,13 @@ class Controller:
             raise SetpointError(
                 f'stamp is {(self._stamp_ns - stamp_ns) * 1e-9:.3f} s before the last tick, limit '
                 f'{SETPOINT_TIMEOUT:g} s either way')
-        present = self._reference_angles if self._move is None else self._goal_or_reference()
-        goal = resolve(self._mechanism, goals, present)
-        move = SoftStep(self._reference.copy(), goal[:2], self.settings.setpoint_duration)
-        self.goal = check_move(self._mechanism, move, self._reference_angles)
-        self._move, self._move_start_ns, self.mode = move, self._stamp_ns, 'track'
-
-    def _goal_or_reference(self) -> Array:
-        return self._reference_angles if self.goal is None else self.goal
+        going_to = self._reference_angles
+        if self._move is not None and self.goal is not None:
+            going_to = self.goal
+        self._move, self.goal = plan(
+            self._mechanism, goals, self._reference, self._reference_angles, going_to,
+            self.settings.setpoint_duration)
+        self._move_start_ns, self.mode = self._stamp_ns, 'track'
 
     def _follow_move(self, stamp_ns: int) -> None:
         if self._move is None:

@@ -17,12 +17,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite, sin
+from math import sin
 
 from fourbar_ros.control.reference import SoftStep
 from fourbar_ros.errors import FourbarError
-from fourbar_ros.mechanism import branch_of, ClosureError, LINK_NAMES, Mechanism, nearest_assembly
+from fourbar_ros.mechanism import ClosureError, LINK_NAMES, Mechanism, nearest_assembly
 from fourbar_ros.mechanism.angles import wrap
+from fourbar_ros.mechanism.by_name import RejectedError, values_by_name
+from fourbar_ros.mechanism.closure import assemblies
 from fourbar_ros.mechanism.parameters import Array
 import numpy as np
 
@@ -32,6 +34,9 @@ CHANGE_POINT_MARGIN = 0.1
 
 # Instants of a planned move at which it is checked.
 CHECKS = 200
+
+# Of |sin|, far above that of an angle and far below anything that matters.
+ROUNDING = 1e-9
 
 # How far two more named links may contradict the closure [rad].
 AGREEMENT = 1e-3
@@ -51,61 +56,61 @@ def check_names(names: Sequence[str], positions: Sequence[float]) -> dict[int, f
     :returns: goal angle [rad] by link index.
     :raises SetpointError: empty, unknown or repeated names, wrong lengths, not finite.
     """
-    if not len(names):
-        raise SetpointError('no link is named')
-    if len(names) != len(positions):
-        raise SetpointError(f'{len(names)} names but {len(positions)} positions')
-    goals: dict[int, float] = {}
-    for name, position in zip(names, positions):
-        if name not in LINK_NAMES:
-            raise SetpointError(f'unknown link {name!r} (known are {", ".join(LINK_NAMES)})')
-        if not isfinite(position):
-            raise SetpointError(f'position of {name} is {position}')
-        link = LINK_NAMES.index(name)
-        if link in goals:
-            raise SetpointError(f'{name} is named twice')
-        goals[link] = float(position)
-    return goals
+    try:
+        return values_by_name(names, positions, LINK_NAMES, 'position')
+    except RejectedError as error:
+        raise SetpointError(str(error)) from None
 
 
-def resolve(mechanism: Mechanism, goals: dict[int, float], present: Array) -> Array:
+def plan(mechanism: Mechanism, goals: dict[int, float], start: Array, present: Array,
+         last_goal: Array, duration: float) -> tuple[SoftStep, Array]:
     """
-    Work out where all four links go.
+    Plan the move that a setpoint asks for.
 
-    Each named link takes the shortest way round. One named link: its partner holds. Two:
-    they determine the rest. More must agree with the closure.
+    Each named link takes the shortest way round. One named link: its partner holds. Two: they
+    determine the rest, on whichever branch the move really ends. More must agree with the closure.
 
     :param goals: goal angle [rad] by link index, any turn.
-    :param present: (4,) where the links are now, or are told to be [rad].
-    :returns: (4,) goal angles, continuous with the present ones [rad].
-    :raises SetpointError: it cannot close, or the named links contradict each other.
+    :param start: (3, 2) reference angle, rate and acceleration of (phi_a, phi_b) now.
+    :param present: (4,) reference of the link angles now [rad].
+    :param last_goal: (4,) where they were going: what is not named goes there still [rad].
+    :param duration: [s].
+    :returns: the move, and the four link angles at its end [rad].
+    :raises SetpointError: it cannot close, contradicts itself, or cannot be reached.
     """
-    near = {link: present[link] + wrap(angle - present[link]) for link, angle in goals.items()}
-    first, *others = sorted(near)
+    goals = {link: last_goal[link] + wrap(angle - last_goal[link])
+             for link, angle in goals.items()}
+    first, *others = sorted(goals)
     if not others:
+        goals[PARTNER[first]] = float(last_goal[PARTNER[first]])
         others = [PARTNER[first]]
-        near[others[0]] = float(present[others[0]])
     known = (first, others[0])
-    guess = np.array(present)
-    guess[list(known)] = [near[link] for link in known]
-    # The two that follow turn roughly with their partners.
+    guess = np.array(last_goal)
+    for link, angle in goals.items():
+        guess[link] = angle
+    # What follows turns roughly with the opposite link.
     for link in set(range(4)) - set(known):
         opposite = (link + 2) % 4
         if opposite in known:
-            guess[link] += near[opposite] - present[opposite]
+            guess[link] += goals[opposite] - last_goal[opposite]
     try:
-        angles = nearest_assembly(mechanism, known, (near[known[0]], near[known[1]]), guess)
+        ends = assemblies(mechanism, known, (goals[known[0]], goals[known[1]]), guess)
     except ClosureError as error:
         raise SetpointError(str(error)) from None
-    for link in others[1:]:
-        if abs(wrap(angles[link] - near[link])) > AGREEMENT:
-            raise SetpointError(
-                f'{LINK_NAMES[link]} would be at {angles[link]:.4f} rad, not at '
-                f'{near[link]:.4f} rad: more than two links must agree with the closure')
-    return angles
+    problems = []
+    for end in ends:
+        move = SoftStep(np.array(start), end[:2], duration)
+        try:
+            reached = follow(mechanism, move, present)
+            _check_end(reached, goals)
+        except SetpointError as error:
+            problems.append(error)
+            continue
+        return move, reached
+    raise problems[0]
 
 
-def check_move(mechanism: Mechanism, move: SoftStep, present: Array) -> Array:
+def follow(mechanism: Mechanism, move: SoftStep, present: Array) -> Array:
     """
     Follow a planned move to its end.
 
@@ -113,6 +118,8 @@ def check_move(mechanism: Mechanism, move: SoftStep, present: Array) -> Array:
     :returns: (4,) link angles at its end [rad].
     :raises SetpointError: it meets a change point, or the loop cannot close on the way.
     """
+    # Keeping the distance, or moving away, is always allowed, whatever rounding says.
+    limit = min(CHANGE_POINT_MARGIN, abs(sin(present[3] - present[2]))) - ROUNDING
     angles = present
     for time in np.linspace(0.0, move.duration, CHECKS):
         phi_a, phi_b = move.at(float(time))[0]
@@ -121,11 +128,16 @@ def check_move(mechanism: Mechanism, move: SoftStep, present: Array) -> Array:
         except ClosureError as error:
             raise SetpointError(f'on the way there {error}') from None
         fold = abs(sin(angles[3] - angles[2]))
-        # A move away from the change point is always allowed.
-        if fold < min(CHANGE_POINT_MARGIN, abs(sin(present[3] - present[2]))):
+        if fold < limit:
             raise SetpointError(
                 f'on the way there link_c and link_d fold onto a line (|sin| = {fold:.3f}, limit '
                 f'{CHANGE_POINT_MARGIN:g}), a change point')
-    if branch_of(angles) != branch_of(present):
-        raise SetpointError(f'it lies on the {branch_of(angles)} branch')
     return angles
+
+
+def _check_end(reached: Array, goals: dict[int, float]) -> None:
+    for link, angle in goals.items():
+        if abs(wrap(reached[link] - angle)) > AGREEMENT:
+            raise SetpointError(
+                f'{LINK_NAMES[link]} would end at {reached[link]:.4f} rad and not at '
+                f'{angle:.4f} rad: the named links do not fit together on this branch')

@@ -14,7 +14,7 @@
 
 """What a testbed is, simulated or real: samples in, torques out, and when it may be driven."""
 
-from fourbar_ros.device.command import CommandError, torques_by_name
+from fourbar_ros.device.command import torques_by_name
 from fourbar_ros.device.gate import ArmingGate, DeviceState
 from fourbar_ros.device.pacing import RealtimePace
 from fourbar_ros.device.protocol import Device, LinkSample, Samples, WheelSample
@@ -22,7 +22,7 @@ from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.device.testbed import Testbed, TestbedSettings, Timing
 
 __all__ = [
-    'ArmingGate', 'CommandError', 'Device', 'DeviceState', 'LinkSample', 'RealtimePace',
+    'ArmingGate', 'Device', 'DeviceState', 'LinkSample', 'RealtimePace',
     'Samples', 'SimulatedTable', 'Testbed', 'TestbedSettings', 'Timing', 'torques_by_name',
     'WheelSample',
 ]

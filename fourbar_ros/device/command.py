@@ -18,22 +18,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import FLYWHEEL_NAMES
+from fourbar_ros.mechanism.by_name import RejectedError, values_by_name
 from fourbar_ros.mechanism.parameters import Array
 import numpy as np
-
-
-class CommandError(FourbarError):
-    """
-    A wheel command that is rejected.
-
-    :ivar kind: one word for counting.
-    """
-
-    def __init__(self, kind: str, message: str) -> None:
-        super().__init__(message)
-        self.kind = kind
 
 
 def torques_by_name(names: Sequence[str], positions: Sequence[float],
@@ -45,21 +33,11 @@ def torques_by_name(names: Sequence[str], positions: Sequence[float],
     :param positions, velocities: must be empty, wheels are commanded by effort.
     :param efforts: torque for each name [N m].
     :returns: (4,) torques in the order a, b, c, d [N m].
-    :raises CommandError: anything else; kinds `fields`, `names`, `length`, `finite`.
+    :raises RejectedError: anything else; kinds `fields`, `names`, `length`, `finite`.
     """
     if len(positions) or len(velocities):
-        raise CommandError('fields', 'position and velocity must be empty, only effort is taken')
-    for index, name in enumerate(names):
-        if name not in FLYWHEEL_NAMES:
-            raise CommandError('names', f'unknown wheel {name!r} (known are '
-                                        f'{", ".join(FLYWHEEL_NAMES)})')
-        if name in names[:index]:
-            raise CommandError('names', f'{name} is named twice')
-    if not len(names) or len(efforts) != len(names):
-        raise CommandError('length', f'{len(names)} names but {len(efforts)} efforts')
+        raise RejectedError('fields', 'position and velocity must be empty, only effort is taken')
     torques = np.zeros(4)
-    for name, effort in zip(names, efforts):
-        if not np.isfinite(effort):
-            raise CommandError('finite', f'effort of {name} is {effort}')
-        torques[FLYWHEEL_NAMES.index(name)] = effort
+    for wheel, effort in values_by_name(names, efforts, FLYWHEEL_NAMES, 'effort').items():
+        torques[wheel] = effort
     return torques

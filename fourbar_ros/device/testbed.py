@@ -25,11 +25,12 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from fourbar_ros.device.command import CommandError, torques_by_name
+from fourbar_ros.device.command import torques_by_name
 from fourbar_ros.device.gate import ArmingGate
 from fourbar_ros.device.protocol import Device, Samples
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import LINK_NAMES
+from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.mechanism.parameters import Array
 import numpy as np
 
@@ -144,12 +145,12 @@ class Testbed:
         Take a wheel command, to act from the last tick on.
 
         :param stamp_ns: the tick that it answers [ns].
-        :raises CommandError: it is rejected whole; also counted.
+        :raises RejectedError: it is rejected whole; also counted.
         """
         try:
             self._check_stamp(stamp_ns)
             torques = torques_by_name(names, positions, velocities, efforts)
-        except CommandError as error:
+        except RejectedError as error:
             self.rejected[error.kind] += 1
             self.last_rejection = str(error)
             raise
@@ -212,15 +213,15 @@ class Testbed:
 
     def _check_stamp(self, stamp_ns: int) -> None:
         if self._tick_ns is None:
-            raise CommandError('stale', 'no tick to answer yet')
+            raise RejectedError('stale', 'no tick to answer yet')
         age_s = (self._tick_ns - stamp_ns) * 1e-9
         if age_s > self._settings.command_timeout_s:
-            raise CommandError('stale', f'stamp is {age_s:g} s older than the last tick, limit '
+            raise RejectedError('stale', f'stamp is {age_s:g} s older than the last tick, limit '
                                         f'{self._settings.command_timeout_s:g} s')
         if age_s < 0.0:
-            raise CommandError('stale', f'stamp is {-age_s:g} s ahead of the last tick')
+            raise RejectedError('stale', f'stamp is {-age_s:g} s ahead of the last tick')
         if self._command_stamp_ns is not None and stamp_ns < self._command_stamp_ns:
-            raise CommandError('stale', 'stamp is older than that of the last command')
+            raise RejectedError('stale', 'stamp is older than that of the last command')
 
     def _answered(self, stamp_ns: int, steady_ns: int) -> None:
         published_ns = self._open_ticks.pop(stamp_ns, None)

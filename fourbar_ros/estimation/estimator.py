@@ -19,12 +19,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, pi
+from math import pi
 
-from fourbar_ros.errors import FourbarError
 from fourbar_ros.estimation.filter import LinkageFilter
 from fourbar_ros.mechanism import ClosureError, LINK_NAMES, Mechanism, nearest_assembly
 from fourbar_ros.mechanism.angles import wrap_angles
+from fourbar_ros.mechanism.by_name import RejectedError, values_by_name
 from fourbar_ros.mechanism.parameters import Array
 import numpy as np
 
@@ -40,18 +40,6 @@ LONGEST_QUEUE = 100
 
 # Standard deviation of the unknown rates at the start [rad/s].
 INITIAL_RATE_SIGMA = 1.0
-
-
-class MeasurementError(FourbarError):
-    """
-    A measurement that cannot be used.
-
-    :ivar kind: one word for counting.
-    """
-
-    def __init__(self, kind: str, message: str) -> None:
-        super().__init__(message)
-        self.kind = kind
 
 
 @dataclass(frozen=True)
@@ -147,11 +135,11 @@ class Estimator:
         :param stamp_ns: time of measurement [ns].
         :param names: any of the four links.
         :param angles: orientation of each [rad].
-        :raises MeasurementError: unusable, taken whole or not at all; also counted.
+        :raises RejectedError: unusable, taken whole or not at all; also counted.
         """
         try:
             measurement = self._checked(stamp_ns, names, angles)
-        except MeasurementError as error:
+        except RejectedError as error:
             self.rejected[error.kind] += 1
             self.last_rejection = str(error)
             raise
@@ -167,18 +155,22 @@ class Estimator:
 
         :param wheel_speeds: (4,) measured, relative to the links [rad/s].
         :returns: the estimate, or None while there is nothing to start from.
-        :raises MeasurementError: wheel speeds that cannot be used, or a tick that was there
+        :raises RejectedError: wheel speeds that cannot be used, or a tick that was there
             already; also counted.
         """
         speeds = np.asarray(wheel_speeds, dtype=float)
         try:
             self._check_tick(stamp_ns, speeds)
-        except MeasurementError as error:
+        except RejectedError as error:
             self.rejected[error.kind] += 1
             self.last_rejection = str(error)
             raise
-        if self._stamp_ns is not None and not 0 < stamp_ns - self._stamp_ns <= LONGEST_GAP_NS:
-            self._filter = None
+        if self._stamp_ns is not None:
+            last_ns = self._stamp_ns
+            if 0 < stamp_ns - last_ns <= LONGEST_GAP_NS:
+                self._pending = [item for item in self._pending if item[0] >= last_ns]
+            else:
+                self._filter = None
         innovation = None
         if self._filter is not None and self._stamp_ns is not None:
             innovation = self._advance(self._filter, self._stamp_ns, stamp_ns, speeds)
@@ -248,28 +240,17 @@ class Estimator:
 
     def _checked(self, stamp_ns: int, names: Sequence[str], angles: Sequence[float]
                  ) -> tuple[int, tuple[int, ...], Array]:
-        if not len(names) or len(names) != len(angles):
-            raise MeasurementError('length', f'{len(names)} names but {len(angles)} positions')
-        for index, name in enumerate(names):
-            if name not in LINK_NAMES:
-                raise MeasurementError('names', f'unknown link {name!r} (known are '
-                                                f'{", ".join(LINK_NAMES)})')
-            if name in names[:index]:
-                raise MeasurementError('names', f'{name} is named twice')
-            if not isfinite(angles[index]):
-                raise MeasurementError('finite', f'position of {name} is {angles[index]}')
-        links = tuple(LINK_NAMES.index(name) for name in names)
+        measured = values_by_name(names, angles, LINK_NAMES, 'position')
+        links = tuple(sorted(measured))
         # A sample of the last tick itself that was overtaken by it still serves the next one.
         if self._stamp_ns is not None and 0 < self._stamp_ns - stamp_ns < LONGEST_GAP_NS:
-            raise MeasurementError('late', 'measured before the last tick')
+            raise RejectedError('late', 'measured before the last tick')
         if any(0 <= self._newest_ns[link] - stamp_ns < LONGEST_GAP_NS for link in links):
-            raise MeasurementError('repeated', 'stamp is not newer than that of the last sample')
-        order = sorted(range(len(links)), key=lambda index: links[index])
-        return (stamp_ns, tuple(links[i] for i in order),
-                wrap_angles([angles[i] for i in order]))
+            raise RejectedError('repeated', 'stamp is not newer than that of the last sample')
+        return stamp_ns, links, wrap_angles([measured[link] for link in links])
 
     def _check_tick(self, stamp_ns: int, speeds: Array) -> None:
         if speeds.shape != (4,) or not np.isfinite(speeds).all():
-            raise MeasurementError('wheels', 'flywheel_states must hold four finite velocities')
+            raise RejectedError('wheels', 'flywheel_states must hold four finite velocities')
         if self._stamp_ns is not None and 0 <= self._stamp_ns - stamp_ns < LONGEST_GAP_NS:
-            raise MeasurementError('stamp', 'tick is not newer than the last one')
+            raise RejectedError('stamp', 'tick is not newer than the last one')

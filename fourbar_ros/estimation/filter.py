@@ -26,6 +26,8 @@ good Gamma is kept, which is exact for a parallelogram.
 
 from __future__ import annotations
 
+from math import sin
+
 from filterpy.kalman import ExtendedKalmanFilter
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.angles import wrap_angles
@@ -170,7 +172,7 @@ def linearise(
     :param noise: (4, 4) receives the covariance that random link torques of density
         `disturbance` [N m/sqrt(Hz)] leave after `duration`.
     """
-    trial_angles, trial_rates = np.empty(4), np.empty(2)
+    trial_angles, trial_rates, trial_gamma = np.empty(4), np.empty(2), gamma.copy()
     for column in range(4):
         for sign in (1.0, -1.0):
             trial_angles[:] = angles
@@ -179,9 +181,12 @@ def linearise(
                 trial_angles[column] += sign * DIFFERENCE
                 trial_angles[2] += sign * DIFFERENCE * gamma[0, column]
                 trial_angles[3] += sign * DIFFERENCE * gamma[1, column]
+                if abs(sin(angles[3] - angles[2])) > GAMMA_IS_LOST:
+                    trial_gamma[:] = gamma_matrix(trial_angles, constants.lengths)
             else:
+                trial_gamma[:] = gamma
                 trial_rates[column - 2] += sign * DIFFERENCE
-            move_links(trial_angles, trial_rates, gamma, wheel_torques, duration, constants,
+            move_links(trial_angles, trial_rates, trial_gamma, wheel_torques, duration, constants,
                        scratch, state)
             for row in range(4):
                 # Angles a, b are state[0:2], rates a, b are state[4:6].

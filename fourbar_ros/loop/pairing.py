@@ -42,5 +42,6 @@ class StampPairs:
                             if stamp > stamp_ns}
             return pair
         if len(self._halves) > DEPTH:
-            del self._halves[min(self._halves)]
+            # The oldest by arrival: a device that starts again may be behind in time.
+            del self._halves[next(iter(self._halves))]
         return None

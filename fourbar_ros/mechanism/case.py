@@ -40,7 +40,7 @@ from fourbar_ros.mechanism.motion import (
     WHEEL_ANGLES,
     WHEEL_SPEEDS,
 )
-from fourbar_ros.mechanism.parameters import Array, LINK_NAMES, Mechanism
+from fourbar_ros.mechanism.parameters import Array, LINK_NAMES, Mechanism, numbers
 import numpy as np
 
 # How far an initial state may be off the closure, relative to the longest link (and per second):
@@ -188,10 +188,7 @@ def _section(values: Any, name: str) -> Mapping[str, Any]:
 def _array(values: Mapping[str, Any], name: str, shape: tuple[int, ...] | None) -> Array:
     if name not in values:
         raise CaseError(f'{name} is missing')
-    try:
-        array = np.array(values[name], dtype=float)
-    except (TypeError, ValueError):
-        raise CaseError(f'{name} must hold numbers') from None
+    array = numbers(name, values[name], CaseError)
     if array.ndim != 1 or (shape is not None and array.shape != shape):
         wanted = f'{shape[0]} numbers, in the order {", ".join(LINK_NAMES)}' if shape else 'a list'
         raise CaseError(f'{name} must be {wanted}, got shape {array.shape}')

@@ -26,7 +26,7 @@ from __future__ import annotations
 from math import acos, atan2, cos, hypot, isfinite, pi, sin
 
 from fourbar_ros.errors import FourbarError
-from fourbar_ros.mechanism.angles import wrap
+from fourbar_ros.mechanism.angles import wrap, wrap_angles
 from fourbar_ros.mechanism.parameters import Array, LINK_NAMES, Mechanism
 import numpy as np
 from numpy.typing import ArrayLike
@@ -91,21 +91,31 @@ def nearest_assembly(
     """
     Complete two link angles to four, on the branch nearest to given angles.
 
+    Parameters and errors as in :func:`assemblies`, of which this is the first.
+    """
+    return assemblies(mechanism, known, angles, near)[0]
+
+
+def assemblies(
+    mechanism: Mechanism, known: tuple[int, int], angles: tuple[float, float], near: ArrayLike,
+) -> list[Array]:
+    """
+    Complete two link angles to four, on both branches.
+
     :param known: indices of the two links that are given (0 for link a).
     :param angles: their orientations [rad].
-    :param near: (4,) link angles [rad]; of the result, the two that are worked out are continuous
+    :param near: (4,) link angles [rad]; of the results, the two that are worked out are continuous
         with them (not wrapped).
-    :returns: (4,) link angles [rad].
+    :returns: two arrays (4,) of link angles, the one nearer to the given ones first [rad].
     :raises ClosureError: the loop cannot close, or the two links do not determine it.
     """
     reference = np.asarray(near, dtype=float)
-    solutions = solve_pair(mechanism, known, angles)
-    unwrapped = []
-    for solution in solutions:
-        result = reference + [wrap(float(x)) for x in solution - reference]
+    completed = []
+    for solution in solve_pair(mechanism, known, angles):
+        result = reference + wrap_angles(solution - reference)
         result[list(known)] = angles
-        unwrapped.append(result)
-    return min(unwrapped, key=lambda result: float(np.abs(result - reference).sum()))
+        completed.append(result)
+    return sorted(completed, key=lambda result: float(np.abs(result - reference).sum()))
 
 
 def solve_pair(

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from fourbar_ros.configuration import config_file, load_yaml
+from fourbar_ros.configuration import check_keys, config_file, load_yaml
 from fourbar_ros.errors import FourbarError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -132,13 +132,9 @@ class Mechanism:
         :param origin: where the values come from, for messages.
         :raises MechanismError: a key is missing or unknown, or a value is refused.
         """
-        known = {item.name for item in fields(cls)}
-        required = {name for name in known if not name.startswith('motor_')}
-        if missing := sorted(required - set(values)):
-            raise MechanismError(f'{origin}: {", ".join(missing)} missing')
-        if unknown := sorted(set(map(str, values)) - known):
-            raise MechanismError(
-                f'{origin}: unknown {", ".join(unknown)} (known are {", ".join(sorted(known))})')
+        motor = {item.name for item in fields(cls) if item.name.startswith('motor_')}
+        rest = {item.name for item in fields(cls)} - motor
+        check_keys(values, rest, origin, MechanismError, optional=motor)
         try:
             return cls(**values)
         except MechanismError as error:
@@ -157,14 +153,24 @@ def load_mechanism(name: str) -> Mechanism:
     return Mechanism.from_mapping(load_yaml(path), str(path))
 
 
-def _checked_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+def numbers(name: str, value: ArrayLike, error: type[FourbarError]) -> Array:
+    """
+    Make a new array of numbers, and of nothing that merely looks like them.
+
+    :param name: what it is, for the message.
+    :param error: what to raise.
+    """
     try:
         given = np.asarray(value)
     except ValueError:      # rows of different lengths
         given = np.asarray(None)
     if given.dtype.kind not in 'iuf':
-        raise MechanismError(f'{name} must hold numbers, got {value!r}')
-    array = np.array(given, dtype=float)
+        raise error(f'{name} must hold numbers, got {value!r}')
+    return np.array(given, dtype=float)
+
+
+def _checked_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    array = numbers(name, value, MechanismError)
     if array.shape != shape:
         raise MechanismError(f'{name} must have shape {shape}, got {array.shape}')
     unlimited = name.startswith('motor_')

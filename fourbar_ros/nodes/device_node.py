@@ -17,11 +17,12 @@
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from fourbar_ros.device import CommandError, RealtimePace, Testbed, TestbedSettings
+from fourbar_ros.device import RealtimePace, Testbed, TestbedSettings
 from fourbar_ros.device.gate import DeviceState
 from fourbar_ros.device.testbed import TIMEOUT_ACTIONS
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES
+from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.nodes.gate_services import GateServices
 from fourbar_ros.nodes.messages import (
     Diagnostics,
@@ -149,7 +150,7 @@ class DeviceNode(Node):
         try:
             self._testbed.command(stamp_of(message), message.name, message.position,
                                   message.velocity, message.effort, steady_ns())
-        except CommandError as error:
+        except RejectedError as error:
             self._log.warn(f'flywheel_command rejected: {error}')
         if self._testbed.clipped > clipped:
             self._log.warn('flywheel_command asks more torque than a motor has: clipped')

@@ -15,8 +15,8 @@
 """The estimator as a node: link angles and ticks in, estimates out."""
 
 from fourbar_ros.estimation import Estimator, EstimatorSettings
-from fourbar_ros.estimation.estimator import MeasurementError
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism
+from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.nodes.messages import (
     Diagnostics,
     JointStatePublisher,
@@ -71,7 +71,7 @@ class EstimatorNode(Node):
     def _on_angles(self, message):
         try:
             self._estimator.measure(stamp_of(message), message.name, message.position)
-        except MeasurementError as error:
+        except RejectedError as error:
             self._log.warn(f'link_angles rejected: {error}')
 
     def _on_tick(self, message):
@@ -79,7 +79,7 @@ class EstimatorNode(Node):
         try:
             estimate = self._estimator.tick(
                 stamp_ns, message.velocity if tuple(message.name) == FLYWHEEL_NAMES else ())
-        except MeasurementError as error:
+        except RejectedError as error:
             self._log.warn(f'flywheel_states rejected: {error}')
             return
         if estimate is not None:

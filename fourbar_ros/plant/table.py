@@ -21,7 +21,7 @@ from dataclasses import dataclass, fields
 from math import isfinite, pi
 from typing import Any
 
-from fourbar_ros.configuration import config_file, load_yaml
+from fourbar_ros.configuration import check_keys, config_file, load_yaml
 from fourbar_ros.errors import FourbarError
 
 
@@ -78,13 +78,14 @@ class Table:
         :raises TableError: a section or key is missing or unknown, or a value is refused.
         """
         sections = {'link_sensors': LinkSensors, 'wheel_encoders': WheelEncoders}
-        _check_keys(origin, values, set(sections))
+        check_keys(values, sections, origin, TableError)
         made = {}
         for name, kind in sections.items():
             section = values[name]
             if not isinstance(section, Mapping):
                 raise TableError(f'{origin}: {name} must be a section of its own')
-            _check_keys(f'{origin}, {name}', section, {item.name for item in fields(kind)})
+            keys = {item.name for item in fields(kind)}
+            check_keys(section, keys, f'{origin}, {name}', TableError)
             try:
                 made[name] = kind(**section)
             except TableError as error:
@@ -107,14 +108,6 @@ def load_table(name: str) -> Table:
 def quantum(counts_per_turn: int) -> float:
     """Turn a resolution in counts per turn into an angle [rad], 0 for none."""
     return 2.0 * pi / counts_per_turn if counts_per_turn else 0.0
-
-
-def _check_keys(origin: str, values: Mapping[str, Any], wanted: set[str]) -> None:
-    if missing := sorted(wanted - set(values)):
-        raise TableError(f'{origin}: {", ".join(missing)} missing')
-    if unknown := sorted(set(map(str, values)) - wanted):
-        raise TableError(
-            f'{origin}: unknown {", ".join(unknown)} (known are {", ".join(sorted(wanted))})')
 
 
 def _check(name: str, value: Any) -> None:

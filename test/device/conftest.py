@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from fourbar_ros.device import (
+    ArmingGate,
     LinkSample,
     Samples,
     Testbed,
@@ -41,6 +42,8 @@ class Bench:
     A device that does what it is told.
 
     :ivar driven: torques of every step.
+    :ivar gate: set by whoever wants to know its state (and reason) at the last step.
+    :ivar gate_then: that state and reason.
     :ivar links: the links that give a sample.
     :ivar breaks: whether the next step fails.
     """
@@ -53,11 +56,14 @@ class Bench:
         self.driven: list[Array] = []
         self.links: tuple[int, ...] = (0, 1, 2, 3)
         self.breaks = False
+        self.gate = ArmingGate()
+        self.gate_then = (self.gate.state, '')
         self.speeds = np.array([10.0, -20.0, 0.0, 5.0])
 
     def step(self, stamp_ns: int, torques: Array) -> Samples:
         """Take down the torques and let the wheels follow them."""
         self.driven.append(np.array(torques))
+        self.gate_then = (self.gate.state, self.gate.reason)
         if self.breaks:
             raise FourbarError('the bus is off')
         self.speeds = self.speeds + torques / self.mechanism.flywheel_inertias * 4e-3
@@ -71,6 +77,7 @@ class Operated:
     def __init__(self, mechanism: Mechanism, settings: TestbedSettings) -> None:
         self.bench = Bench(mechanism)
         self.testbed = Testbed(self.bench, settings)
+        self.bench.gate = self.testbed.gate
         self.stamp_ns = 1_000_000_000
         self.steady_ns = 50_000_000_000
 

@@ -17,9 +17,9 @@
 from itertools import permutations
 from math import inf, nan
 
-from fourbar_ros.device import CommandError
 from fourbar_ros.device.command import torques_by_name
 from fourbar_ros.mechanism import FLYWHEEL_NAMES
+from fourbar_ros.mechanism.by_name import RejectedError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
@@ -28,8 +28,8 @@ A, B, C, D = FLYWHEEL_NAMES
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
-def rejected(names: list[str], efforts: list[float], **others: list[float]) -> CommandError:
-    with pytest.raises(CommandError) as caught:
+def rejected(names: list[str], efforts: list[float], **others: list[float]) -> RejectedError:
+    with pytest.raises(RejectedError) as caught:
         torques_by_name(
             names, others.get('positions', []), others.get('velocities', []), efforts)
     return caught.value
@@ -68,7 +68,7 @@ def test_repeated_wheel_is_named(names: list[str]) -> None:
 def test_lengths_must_agree(names: list[str], efforts: list[float]) -> None:
     error = rejected(names, efforts)
     assert error.kind == 'length'
-    assert f'{len(names)} names but {len(efforts)} efforts' in str(error)
+    assert ('named' if not names else f'{len(names)} names but {len(efforts)}') in str(error)
 
 
 @pytest.mark.parametrize('value', [nan, inf, -inf])

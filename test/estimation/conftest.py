@@ -14,23 +14,8 @@
 
 """Linkages for the filter."""
 
-from fourbar_ros.mechanism import load_mechanism, Mechanism
+from fourbar_ros.mechanism import Mechanism
 import pytest
-
-
-@pytest.fixture(scope='session')
-def paper() -> Mechanism:
-    """Load the linkage of the paper."""
-    return load_mechanism('paper')
-
-
-@pytest.fixture(scope='session')
-def uneven() -> Mechanism:
-    """Make a linkage with nothing equal to anything else."""
-    return Mechanism(  # type: ignore[arg-type]
-        [0.12, 0.08, 0.11, 0.10], [0.02, 0.03, 0.025, 0.018], [2.2e-5, 1.5e-5, 3e-5, 1.8e-5],
-        [[0.05, 0.01], [0.04, -0.01], [0.06, 0.005], [0.05, 0.0]], [3e-7, 4e-7, 5e-7, 2e-7],
-        [1e-4] * 4, [500.0] * 4)
 
 
 @pytest.fixture(params=['paper', 'uneven'])

@@ -21,8 +21,8 @@ from math import inf, nan, pi
 from typing import Any
 
 from fourbar_ros.estimation import Estimate, Estimator, EstimatorSettings
-from fourbar_ros.estimation.estimator import MeasurementError
 from fourbar_ros.mechanism import assemble, LINK_NAMES, Mechanism
+from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.plant import InitialState, Plant, Table
 from fourbar_ros.plant.table import LinkSensors, WheelEncoders
 import numpy as np
@@ -239,7 +239,7 @@ def running(paper: Mechanism) -> Run:
 def test_unusable_sample_is_rejected_whole_and_counted(
     kind: str, names: list[str], angles: list[float], running: Run,
 ) -> None:
-    with pytest.raises(MeasurementError) as caught:
+    with pytest.raises(RejectedError) as caught:
         running.estimator.measure(running.stamp_ns + PERIOD_NS, names, angles)
     assert caught.value.kind == kind
     assert running.estimator.rejected == Counter({kind: 1})
@@ -253,7 +253,7 @@ def test_repeated_sample_is_rejected(running: Run) -> None:
     stamp = running.stamp_ns + PERIOD_NS
     running.estimator.measure(stamp, ['link_a', 'link_b'], [0.0, 1.0])
     for names in (['link_a'], ['link_b', 'link_c']):
-        with pytest.raises(MeasurementError) as caught:
+        with pytest.raises(RejectedError) as caught:
             running.estimator.measure(stamp, names, [0.0] * len(names))
         assert caught.value.kind == 'repeated'
     running.estimator.measure(stamp, ['link_c'], [0.0])
@@ -262,7 +262,7 @@ def test_repeated_sample_is_rejected(running: Run) -> None:
 
 @pytest.mark.parametrize('age_ms', [4, 500, 999])
 def test_late_sample_is_rejected(age_ms: int, running: Run) -> None:
-    with pytest.raises(MeasurementError) as caught:
+    with pytest.raises(RejectedError) as caught:
         running.estimator.measure(running.stamp_ns - age_ms * 1_000_000, ['link_a'], [0.5])
     assert caught.value.kind == 'late'
     assert running.estimator.rejected == Counter(late=1)
@@ -274,7 +274,7 @@ def test_very_late_sample_does_not_pass_for_a_new_one(age_s: int, running: Run) 
     try:
         running.estimator.measure(
             running.stamp_ns - age_s * 1_000_000_000, list(LINK_NAMES), [0.5, 1.5, 0.5, 1.5])
-    except MeasurementError:
+    except RejectedError:
         pass
     (estimate,) = running.ticks(1)
     assert np.abs(running.error(estimate)).max() < 1e-6
@@ -292,7 +292,7 @@ def test_sample_of_the_last_tick_still_serves_the_next(running: Run) -> None:
 @pytest.mark.parametrize('speeds', [[0.0] * 3, [0.0] * 5, [], [0.0, nan, 0.0, 0.0],
                                     [inf, 0.0, 0.0, 0.0]])
 def test_unusable_wheel_speeds_are_rejected(speeds: list[float], running: Run) -> None:
-    with pytest.raises(MeasurementError) as caught:
+    with pytest.raises(RejectedError) as caught:
         running.estimator.tick(running.stamp_ns + PERIOD_NS, speeds)
     assert caught.value.kind == 'wheels'
     assert running.estimator.rejected == Counter(wheels=1)
@@ -302,7 +302,7 @@ def test_unusable_wheel_speeds_are_rejected(speeds: list[float], running: Run) -
 
 @pytest.mark.parametrize('behind_ns', [0, 1, PERIOD_NS])
 def test_tick_that_was_there_is_rejected(behind_ns: int, running: Run) -> None:
-    with pytest.raises(MeasurementError) as caught:
+    with pytest.raises(RejectedError) as caught:
         running.estimator.tick(running.stamp_ns - behind_ns, STILL)
     assert caught.value.kind == 'stamp'
     assert running.estimator.starts == 1

@@ -96,11 +96,13 @@ class Process:
     One `fourbar NAME ...` in a process of its own.
 
     :param folder: for what it prints.
+    :ivar awaited: whether somebody waited for its end.
     :ivar shared_memory: files of the middleware that it was seen to use.
     """
 
     def __init__(self, name, arguments, environment, folder, **options):
         self.name = name
+        self.awaited = False
         self.shared_memory = set()
         self._out, self._err = (folder / f'{stream}.txt' for stream in ('stdout', 'stderr'))
         with self._out.open('wb') as out, self._err.open('wb') as err:
@@ -123,8 +125,9 @@ class Process:
         """Send a signal."""
         self.popen.send_signal(number)
 
-    def end(self, number=None, seconds=DEADLINE_S):
+    def end(self, number=None, seconds=2 * DEADLINE_S):
         """Wait for the end, after a signal if one is given, and return the exit code."""
+        self.awaited = True
         if self.popen.poll() is None:
             self.shared_memory |= shared_memory_of(self.popen.pid)
             if number is not None:
@@ -168,13 +171,13 @@ class Suite:
     """
 
     def __init__(self, folder):
-        self._folder = folder
+        self.folder = folder
         self._started = []
         self._before = set(map(str, Path('/dev/shm').glob('*fast*')))
 
     def start(self, name, *arguments, environment=None, **options):
         """Start `fourbar NAME ARGUMENTS`."""
-        folder = self._folder / f'{len(self._started)}_{name}'
+        folder = self.folder / f'{len(self._started)}_{name}'
         folder.mkdir()
         process = Process(name, arguments, environment or {}, folder, **options)
         self._started.append(process)
@@ -197,18 +200,14 @@ class Suite:
                 for name in ('plant', 'estimator', 'controller')}
 
     def close(self):
-        """Stop what still runs and check that all nodes ended cleanly."""
-        running = [process for process in self._started if process.popen.poll() is None]
+        """Stop the nodes that still run and check that all ended cleanly."""
+        # Those that were waited for are their tests' own business.
+        unwatched = [process for process in self._started if not process.awaited]
         try:
-            for name in STOP_ORDER:
-                for process in running:
-                    if process.name == name:
-                        process.end(signal.SIGINT)
-            for process in running:
+            for process in sorted(unwatched, key=lambda one: STOP_ORDER.index(one.name)):
                 process.end(signal.SIGINT)
-            for process in running:
-                if process.name in STOP_ORDER:
-                    process.check_clean()
+            for process in unwatched:
+                process.check_clean()
         finally:
             for process in self._started:
                 if process.popen.poll() is None:

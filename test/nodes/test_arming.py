@@ -14,7 +14,6 @@
 
 """Who may drive the wheels, what stops them, and what the wheels do then."""
 
-import os
 import signal
 
 import numpy as np
@@ -154,7 +153,8 @@ def test_emergency_stop_is_latched_until_reset(testbed):
     assert testbed.status('device_status')['state'] == 'emergency_stop'
 
     assert testbed.trigger('reset_emergency_stop').success
-    assert testbed.status('device_status', state='disarmed')['reason'] == 'emergency_stop was reset'
+    status = testbed.status('device_status', state='disarmed')
+    assert status['reason'] == 'emergency_stop was reset'
     assert_coasting(testbed)
     assert testbed.arm().success
 
@@ -225,7 +225,8 @@ def test_plant_that_nobody_commands_disarms(testbed):
     testbed.more('sim/flywheel_states', 50)
     testbed.arm()
     status = testbed.status(
-        'device_status', state='disarmed', reason=f'no flywheel_command for {COMMAND_TIMEOUT_S:g} s')
+        'device_status', state='disarmed',
+        reason=f'no flywheel_command for {COMMAND_TIMEOUT_S:g} s')
     assert float(status['since']) > 1e9
 
 
@@ -284,9 +285,9 @@ def moving(suite, make_probe, no_shared_memory):
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGSTOP], ids=lambda n: n.name)
 def test_lost_controller_leaves_the_wheels_coasting(moving, number):
     nodes, watcher = moving
-    pid = nodes['controller'].popen.pid
+    controller = nodes['controller']
 
-    os.kill(pid, number)
+    controller.send(number)
 
     status = watcher.status('device_status', state='disarmed')
     assert status['reason'] == f'no flywheel_command for {COMMAND_TIMEOUT_S:g} s'
@@ -295,10 +296,11 @@ def test_lost_controller_leaves_the_wheels_coasting(moving, number):
               if any(message.effort)]
     silent_s = (max(driven) - stamp_of(watcher.received['flywheel_command'][-1])) * 1e-9
     assert 0.5 * COMMAND_TIMEOUT_S < silent_s < COMMAND_TIMEOUT_S + A_FEW_TICKS_S
-    if number == signal.SIGSTOP:
-        os.kill(pid, signal.SIGCONT)
-        # It comes back and finds the device disarmed: no goal, no torque.
-        resumed = watcher.status('controller_status', mode='disarmed')
-        assert resumed['goal'] == ''
-        assert_coasting(watcher)
-        assert watcher.status('device_status')['state'] == 'disarmed'
+    if number == signal.SIGKILL:
+        assert controller.end() == -number
+        return
+    # It comes back and finds the device disarmed: no goal, no torque.
+    controller.send(signal.SIGCONT)
+    assert watcher.status('controller_status', mode='disarmed')['goal'] == ''
+    assert_coasting(watcher)
+    assert watcher.status('device_status')['state'] == 'disarmed'

@@ -1,0 +1,33 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Linkages that many tests use."""
+
+from fourbar_ros.mechanism import load_mechanism, Mechanism
+import pytest
+
+
+@pytest.fixture(scope='session')
+def paper() -> Mechanism:
+    """Load the linkage of the paper."""
+    return load_mechanism('paper')
+
+
+@pytest.fixture(scope='session')
+def uneven() -> Mechanism:
+    """Make a linkage with nothing equal to anything else."""
+    return Mechanism(  # type: ignore[arg-type]
+        [0.12, 0.08, 0.11, 0.10], [0.02, 0.03, 0.025, 0.018], [2.2e-5, 1.5e-5, 3e-5, 1.8e-5],
+        [[0.05, 0.01], [0.04, -0.01], [0.06, 0.005], [0.05, 0.0]], [3e-7, 4e-7, 5e-7, 2e-7],
+        [1e-4] * 4, [500.0] * 4)

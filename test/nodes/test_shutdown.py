@@ -1,0 +1,87 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Every node ends when it is asked to: quickly, silently, and with the wheels let go."""
+
+import signal
+
+import pytest
+from sensor_msgs.msg import JointState
+
+pytestmark = pytest.mark.node
+
+# Two seconds, and what a busy machine takes.
+SHUTDOWN_S = 2.0 + 3.0
+SIGNALS = pytest.mark.parametrize(
+    'number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+
+
+@SIGNALS
+def test_moving_testbed_ends_cleanly(suite, make_probe, number):
+    """Controller, estimator, plant, in the middle of a move."""
+    namespace = f'/{number.name.lower()}'
+    nodes = suite.nodes(namespace)
+    probe = make_probe(namespace)
+    probe.follow('flywheel_command', 'sim/flywheel_states', 'flywheel_states')
+    probe.newest('flywheel_command')
+    probe.wait(lambda: probe.arm().success)
+    probe.status('controller_status', mode='hold')
+    probe.setpoint_verdict(JointState(name=['link_a'], position=[0.5]),
+                           probe.publisher(JointState, 'setpoint'))
+    probe.wait(lambda: any(probe.received['flywheel_command'][-1].effort))
+
+    assert nodes['controller'].end(number, SHUTDOWN_S) == 0
+    nodes['controller'].check_clean()
+    # What it said last: no torque.
+    probe.wait(lambda: not any(probe.received['flywheel_command'][-1].effort))
+    count = len(probe.received['flywheel_command'])
+    status = probe.status('device_status', state='disarmed')
+    assert 'no flywheel_command' in status['reason']
+    assert len(probe.received['flywheel_command']) == count
+
+    probe.drive([1e-5] * 4)
+    probe.wait(lambda: probe.arm().success)
+    for name in ('estimator', 'plant'):
+        assert nodes[name].end(number, SHUTDOWN_S) == 0
+        nodes[name].check_clean()
+    assert probe.status('device_status', state='disarmed')['reason'] == 'the node ends'
+
+
+@pytest.mark.parametrize('name', ['plant', 'estimator', 'controller'])
+def test_node_alone_ends_as_soon_as_it_is_asked_to(suite, make_probe, name):
+    """Without anybody to talk to there is nothing to wait for."""
+    process = suite.node(name, namespace=f'/alone_{name}')
+    probe = make_probe(f'/alone_{name}')
+    probe.diagnosis(f'alone_{name}/{name}')
+    assert process.end(signal.SIGINT, SHUTDOWN_S) == 0
+    process.check_clean()
+    assert process.stdout == '' or name == 'plant'
+
+
+def test_second_signal_does_no_harm(suite, make_probe):
+    process = suite.node('controller', namespace='/twice')
+    make_probe('/twice').diagnosis('twice/controller')
+    for _ in range(3):
+        process.send(signal.SIGINT)
+    assert process.end(seconds=SHUTDOWN_S) == 0
+    process.check_clean()
+
+
+def test_signal_during_the_start_is_no_outcry(suite, make_probe):
+    """It ends, whether or not it was ready, and never with a traceback of ours."""
+    process = suite.node('plant', namespace='/early')
+    make_probe().wait(lambda: process.stderr)
+    process.send(signal.SIGINT)
+    assert process.end(seconds=SHUTDOWN_S) == 0
+    process.check_clean()
