@@ -92,7 +92,7 @@ def reduced_form(mechanism: Mechanism, link_angles: ArrayLike, link_rates: Array
     rates = np.asarray(link_rates, dtype=float)
     if sin(angles[3] - angles[2]) == 0.0:
         raise ChangePointError('links c and d lie on a line: Gamma does not exist here')
-    a00, a01, a11, b0, b1, g1, g2, g3, g4 = reduced_terms(
+    a00, a01, a11, b0, b1, g1, g2, g3, g4, _, _ = reduced_terms(
         angles[0], angles[1], angles[2], angles[3], rates[0], rates[1], mechanism.constants)
     return ReducedForm(
         np.array([[a00, a01], [a01, a11]]), np.array([b0, b1]), np.array([[g1, g2], [g3, g4]]))
@@ -177,11 +177,12 @@ def dependent_rates(angles: Array, lengths: Array) -> tuple[float, float, float,
 def reduced_terms(
     phi_a: float, phi_b: float, phi_c: float, phi_d: float, rate_a: float, rate_b: float,
     constants: Constants,
-) -> tuple[float, float, float, float, float, float, float, float, float]:
+) -> tuple[float, float, float, float, float, float, float, float, float, float, float]:
     """
     Evaluate A, b and Gamma of paper eq. 6 from four angles on the closure and two rates.
 
-    :returns: A00, A01, A11, b0, b1, Gamma_1, Gamma_2, Gamma_3, Gamma_4.
+    :returns: A00, A01, A11, b0, b1, Gamma_1, Gamma_2, Gamma_3, Gamma_4, and what the rates alone
+        give the accelerations of c and d: sigma_c, sigma_d.
     """
     lengths = constants.lengths
     cosine = constants.cosine
@@ -242,7 +243,7 @@ def reduced_terms(
     a11 = m_bb + 2.0 * (m_bc * g2 + m_bd * g4) + g2 * mb_c + g4 * mb_d
     b0 = f_a + g1 * f_c + g3 * f_d
     b1 = f_b + g2 * f_c + g4 * f_d
-    return a00, a01, a11, b0, b1, g1, g2, g3, g4
+    return a00, a01, a11, b0, b1, g1, g2, g3, g4, sigma_c, sigma_d
 
 
 @kernel
@@ -265,27 +266,15 @@ def link_accelerations(angles: Array, rates: Array, forces: Array, constants: Co
 @kernel
 def _reduced_accelerations(angles: Array, rates: Array, forces: Array, constants: Constants,
                            out: Array) -> None:
-    a00, a01, a11, b0, b1, g1, g2, g3, g4 = reduced_terms(
+    a00, a01, a11, b0, b1, g1, g2, g3, g4, sigma_c, sigma_d = reduced_terms(
         angles[0], angles[1], angles[2], angles[3], rates[0], rates[1], constants)
     f0 = forces[0] + g1 * forces[2] + g3 * forces[3] - b0
     f1 = forces[1] + g2 * forces[2] + g4 * forces[3] - b1
     determinant = a00 * a11 - a01 * a01
     out[0] = (a11 * f0 - a01 * f1) / determinant
     out[1] = (a00 * f1 - a01 * f0) / determinant
-    lengths = constants.lengths
-    # The dependent accelerations Gamma du + sigma, with sigma as in reduced_terms.
-    fold = sin(angles[3] - angles[2])
-    rate_c = g1 * rates[0] + g2 * rates[1]
-    rate_d = g3 * rates[0] + g4 * rates[1]
-    in_c = in_d = 0.0
-    for j, rate in ((0, rates[0]), (1, rates[1]), (2, rate_c), (3, rate_d)):
-        arm = lengths[j] * rate * rate
-        if j == 0 or j == 3:
-            arm = -arm
-        in_c += arm * cos(angles[3] - angles[j])
-        in_d += arm * cos(angles[2] - angles[j])
-    out[2] = g1 * out[0] + g2 * out[1] + in_c / (lengths[2] * fold)
-    out[3] = g3 * out[0] + g4 * out[1] + in_d / (lengths[3] * fold)
+    out[2] = g1 * out[0] + g2 * out[1] + sigma_c
+    out[3] = g3 * out[0] + g4 * out[1] + sigma_d
 
 
 @kernel

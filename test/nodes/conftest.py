@@ -18,6 +18,7 @@ from contextlib import contextmanager
 import fcntl
 import os
 from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
@@ -147,7 +148,8 @@ def shared_memory_of(pid):
     names = set()
     for line in Path(f'/proc/{pid}/maps').read_text().splitlines():
         path = line.rpartition(' ')[2]
-        if path.startswith(('/dev/shm/fast', '/dev/shm/sem.fast')):
+        # Ports from 7000 on are common to all domains, so they may be anybody's.
+        if re.match(r'/dev/shm/(sem\.)?fast(?!rtps_port70)', path):
             names.add(path)
     return names
 
@@ -241,6 +243,7 @@ class Probe:
 
     def close(self):
         """End ROS in this context."""
+        self._executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
 
