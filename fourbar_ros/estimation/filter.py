@@ -26,18 +26,17 @@ good Gamma is kept, which is exact for a parallelogram.
 
 from __future__ import annotations
 
-from math import sin
+from math import pi, sin
 
 from filterpy.kalman import ExtendedKalmanFilter
 from fourbar_ros.mechanism import Mechanism
-from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.mechanism.compiled import kernel
 from fourbar_ros.mechanism.dynamics import (
     gamma_matrix,
     mass_matrix,
     project_onto_closure,
 )
-from fourbar_ros.mechanism.motion import advance_state, LINK_ANGLES, LINK_RATES, STATE_SIZE
+from fourbar_ros.mechanism.motion import advance_state, STATE_SIZE
 from fourbar_ros.mechanism.parameters import Array, Constants
 import numpy as np
 
@@ -51,6 +50,9 @@ DIFFERENCE = 1e-6
 class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
     """
     The filter proper: predict with wheel motion, correct with link angles.
+
+    State, covariances, gain and innovation are filterpy's attributes. Its two steps are done by
+    compiled kernels, which take a third of the time.
 
     :ivar angles: (4,) link angles that belong to x, continuous [rad].
     :param mechanism: the linkage.
@@ -69,7 +71,8 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self._state = np.zeros(STATE_SIZE)
         self.angles = np.array(angles)
         self._to_links = np.vstack([np.eye(2), np.eye(2)])
-        self._refresh_gamma()
+        if abs(sin(angles[3] - angles[2])) > GAMMA_IS_LOST:
+            self._to_links[2:] = gamma_matrix(self.angles, self._constants.lengths)
         self.x = np.array([angles[0], angles[1], 0.0, 0.0])
         self.P = np.diag([angle_variance, angle_variance, rate_variance, rate_variance])
 
@@ -98,19 +101,9 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         :param duration: [s].
         :param wheel_torques: (4,) If dOmega/dt, the wheels' measured relative motion [N m].
         """
-        self.F, self.Q = np.empty((4, 4)), np.empty((4, 4))
-        linearise(self.angles, self.x[2:], self.gamma, wheel_torques, duration, self._disturbance,
-                  self._constants, self._scratch, self._state, self.F, self.Q)
-        move_links(self.angles, self.x[2:], self.gamma, wheel_torques, duration,
-                   self._constants, self._scratch, self._state)
-        self.predict()
-
-    def predict_x(self, u: object = 0) -> None:
-        """Take over the state that :meth:`move` integrated (called by filterpy)."""
-        self.angles = self._state[LINK_ANGLES].copy()
-        self._refresh_gamma()
-        rates = self._state[LINK_RATES]
-        self.x = np.array([self.angles[0], self.angles[1], rates[0], rates[1]])
+        predict(self.x, self.P, self.angles, self._to_links, wheel_torques, duration,
+                self._disturbance, self._constants, self._scratch, self._state, self.F, self.Q)
+        self.x_prior, self.P_prior = self.x.copy(), self.P.copy()
 
     def correct(self, links: tuple[int, ...], measured: Array, variance: float) -> tuple[
             Array, float]:
@@ -122,23 +115,76 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         :param variance: of each [rad^2].
         :returns: the wrapped innovations (n,) [rad] and their normalised square (NIS).
         """
-        rows = list(links)
-        jacobian = np.zeros((len(rows), 4))
-        jacobian[:, :2] = self._to_links[rows]
-        before = self.x[:2].copy()
-        self.update(
-            measured, lambda x: jacobian, lambda x: self.angles[rows],
-            R=variance * np.eye(len(rows)), residual=lambda z, h: wrap_angles(z - h))
-        self._state[LINK_ANGLES] = self.angles + self._to_links @ (self.x[:2] - before)
-        self._state[LINK_RATES] = self.rates
-        project_onto_closure(
-            self._state[LINK_ANGLES], self._state[LINK_RATES], self._constants)
-        self.predict_x()
-        return self.y, float(self.y @ self.SI @ self.y)
+        self.y, self.S, self.SI, self.K, nis = correct(
+            self.x, self.P, self.angles, self._to_links, np.array(links), measured, variance,
+            self._constants, self._state)
+        self.x_post, self.P_post = self.x.copy(), self.P.copy()
+        return self.y, nis
 
-    def _refresh_gamma(self) -> None:
-        if abs(np.sin(self.angles[3] - self.angles[2])) > GAMMA_IS_LOST:
-            self._to_links[2:] = gamma_matrix(self.angles, self._constants.lengths)
+
+@kernel
+def predict(x: Array, covariance: Array, angles: Array, to_links: Array, wheel_torques: Array,
+            duration: float, disturbance: float, constants: Constants, scratch: Array,
+            state: Array, transition: Array, noise: Array) -> None:
+    """
+    Predict in place: filterpy's `predict` with the linkage as the model.
+
+    :param x, covariance: (4,) and (4, 4), the filter's.
+    :param angles: (4,) link angles that belong to x [rad].
+    :param to_links: (4, 2) from links a, b to all four; its lower half is Gamma.
+    :param transition, noise: (4, 4) receive F and Q.
+    """
+    gamma = to_links[2:]
+    linearise(angles, x[2:], gamma, wheel_torques, duration, disturbance, constants, scratch,
+              state, transition, noise)
+    move_links(angles, x[2:], gamma, wheel_torques, duration, constants, scratch, state)
+    # P = F P F' + Q
+    covariance[:] = transition @ covariance @ transition.T + noise
+    _take_over(state, x, angles, to_links, constants.lengths)
+
+
+@kernel
+def correct(x: Array, covariance: Array, angles: Array, to_links: Array, links: Array,
+            measured: Array, variance: float, constants: Constants, state: Array
+            ) -> tuple[Array, Array, Array, Array, float]:
+    """
+    Correct in place: filterpy's `update`, with wrapped innovations.
+
+    Parameters as in :func:`predict` and :meth:`LinkageFilter.correct`.
+
+    :returns: y (n,), S (n, n), its inverse, K (4, n) and the normalised innovation squared.
+    """
+    count = links.size
+    jacobian = np.zeros((count, 4))
+    y = np.empty(count)
+    for row in range(count):
+        jacobian[row, :2] = to_links[links[row]]
+        y[row] = pi - (pi - measured[row] + angles[links[row]]) % (2.0 * pi)
+    noise = variance * np.eye(count)
+    # S = H P H' + R, K = P H' S^-1
+    s = jacobian @ covariance @ jacobian.T + noise
+    inverse = np.linalg.inv(s)
+    gain = covariance @ jacobian.T @ inverse
+    change = gain @ y
+    x += change
+    # P = (I - K H) P (I - K H)' + K R K'
+    rest = np.eye(4) - gain @ jacobian
+    covariance[:] = rest @ covariance @ rest.T + gain @ noise @ gain.T
+    state[0:4] = angles + to_links @ change[:2]
+    state[4:8] = to_links @ x[2:]
+    project_onto_closure(state[0:4], state[4:8], constants)
+    _take_over(state, x, angles, to_links, constants.lengths)
+    return y, s, inverse, gain, float(y @ inverse @ y)
+
+
+@kernel
+def _take_over(state: Array, x: Array, angles: Array, to_links: Array, lengths: Array) -> None:
+    """Set x and what belongs to it from angles and rates of the links."""
+    angles[:] = state[0:4]
+    x[:2] = state[0:2]
+    x[2:] = state[4:6]
+    if abs(sin(angles[3] - angles[2])) > GAMMA_IS_LOST:
+        to_links[2:] = gamma_matrix(angles, lengths)
 
 
 @kernel

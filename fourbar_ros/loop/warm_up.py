@@ -43,7 +43,7 @@ def warm_up() -> None:
 
 def main() -> None:
     """Compile, and say so if there is something to compile."""
-    notice = Timer(NOTICE_AFTER, print, ['Compiling the kernels, once (about 10 s)'],
+    notice = Timer(NOTICE_AFTER, print, ['Compiling the kernels, once (about 15 s)'],
                    {'flush': True})
     notice.start()
     warm_up()

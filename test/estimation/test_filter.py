@@ -16,8 +16,10 @@
 
 from dataclasses import dataclass, replace
 
+from filterpy.kalman import ExtendedKalmanFilter
 from fourbar_ros.estimation.filter import LinkageFilter
 from fourbar_ros.mechanism import assemble, Mechanism, nearest_assembly, reduced_form
+from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.mechanism.motion import advance_state, STATE_SIZE
 from fourbar_ros.plant import InitialState, Plant, Table
 from fourbar_ros.plant.table import LinkSensors, WheelEncoders
@@ -267,3 +269,38 @@ def test_measured_link_tells_its_partner(paper: Mechanism) -> None:
         linkage.correct((2, 3), target[2:], 1e-6)
     # What the prior of 0.1 rad still weighs after a hundred samples of 1 mrad: 1e-6 of 0.05 rad.
     np.testing.assert_allclose(linkage.angles, target, rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize('links', [(0, 1, 2, 3), (0, 2), (3,)], ids=str)
+@pytest.mark.parametrize('seed', range(5))
+def test_compiled_steps_are_those_of_filterpy(
+    links: tuple[int, ...], seed: int, mechanism: Mechanism,
+) -> None:
+    """Predict and correct once, and let filterpy do the same with the same matrices."""
+    rng = np.random.default_rng(seed)
+    angles = assemble(mechanism, 3.0, 4.3)
+    linkage = LinkageFilter(mechanism, angles, 1e-4, 1e-2, 1e-5)
+    linkage.move(PERIOD, mechanism.flywheel_inertias * rng.normal(size=4))
+    textbook = ExtendedKalmanFilter(dim_x=4, dim_z=len(links))
+    textbook.x, textbook.P = np.array([3.0, 4.3, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-2, 1e-2])
+    textbook.F, textbook.Q = linkage.F, linkage.Q
+    textbook.predict()
+    np.testing.assert_allclose(linkage.P, textbook.P, rtol=1e-12, atol=0.0)
+
+    # From here on the same state, which the linkage moves better than F alone.
+    textbook.x = linkage.x.copy()
+    predicted = linkage.angles[list(links)]
+    jacobian = np.zeros((len(links), 4))
+    jacobian[:, :2] = np.vstack([np.eye(2), linkage.gamma])[list(links)]
+    measured = predicted + rng.normal(scale=1e-3, size=len(links)) - 2.0 * np.pi
+    variance = 3e-6
+    textbook.update(
+        measured, lambda x: jacobian, lambda x: predicted, R=variance * np.eye(len(links)),
+        residual=lambda z, h: wrap_angles(z - h))
+    innovation, nis = linkage.correct(links, measured, variance)
+    np.testing.assert_allclose(innovation, textbook.y, rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(linkage.x, textbook.x, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(linkage.K, textbook.K, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(linkage.P, textbook.P, rtol=1e-12, atol=1e-18)
+    # Wrapping by a turn leaves 1e-15 rad of innovations of 1e-3 rad.
+    assert nis == pytest.approx(textbook.mahalanobis ** 2, rel=1e-11)

@@ -14,11 +14,10 @@
 
 """Nodes in processes of their own on a domain of their own, and a probe that watches them."""
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import fcntl
 import os
 from pathlib import Path
-import re
 import signal
 import subprocess
 import sys
@@ -47,9 +46,6 @@ LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 # A node ends in this order, so that none complains about another one's silence.
 STOP_ORDER = ('controller', 'estimator', 'plant')
-
-# For a process that will be killed: Fast DDS leaves its shared memory behind.
-NO_SHARED_MEMORY = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
 
 
 def stamp_of(message):
@@ -97,14 +93,14 @@ class Process:
     One `fourbar NAME ...` in a process of its own.
 
     :param folder: for what it prints.
+    :param shared_memory: takes note of what it owns.
     :ivar awaited: whether somebody waited for its end.
-    :ivar shared_memory: files of the middleware that it was seen to use.
     """
 
-    def __init__(self, name, arguments, environment, folder, **options):
+    def __init__(self, name, arguments, environment, folder, shared_memory, **options):
         self.name = name
         self.awaited = False
-        self.shared_memory = set()
+        self._shared_memory = shared_memory
         self._out, self._err = (folder / f'{stream}.txt' for stream in ('stdout', 'stderr'))
         with self._out.open('wb') as out, self._err.open('wb') as err:
             self.popen = subprocess.Popen(
@@ -130,11 +126,19 @@ class Process:
         """Wait for the end, after a signal if one is given, and return the exit code."""
         self.awaited = True
         if self.popen.poll() is None:
-            self.shared_memory |= shared_memory_of(self.popen.pid)
+            self._shared_memory.note(self.popen.pid)
             if number is not None:
                 self.popen.send_signal(signal.SIGCONT)
                 self.popen.send_signal(number)
         return self.popen.wait(seconds)
+
+    def kill(self):
+        """Kill it."""
+        self.awaited = True
+        self._shared_memory.note(self.popen.pid)
+        self._shared_memory.spoiled = True
+        self.popen.kill()
+        self.popen.wait()
 
     def check_clean(self):
         """Fail unless it ended as asked and without an outcry."""
@@ -144,25 +148,49 @@ class Process:
 
 
 def shared_memory_of(pid):
-    """Return the middleware's shared-memory files that a process uses."""
+    """Return the shared-memory files that a process owns: it keeps their lock files open."""
     names = set()
-    for line in Path(f'/proc/{pid}/maps').read_text().splitlines():
-        path = line.rpartition(' ')[2]
-        # Ports from 7000 on are common to all domains, so they may be anybody's.
-        if re.match(r'/dev/shm/(sem\.)?fast(?!rtps_port70)', path):
-            names.add(path)
-    return names
+    for link in Path(f'/proc/{pid}/fd').iterdir():
+        with suppress(OSError):     # closed in the meantime
+            target = Path(os.readlink(link))
+            if target.parent == Path('/dev/shm') and target.name.endswith('_el'):
+                names.add(target.name[:-len('_el')])
+    return {Path('/dev/shm', form.format(name)) for name in names
+            for form in ('{}', '{}_el', 'sem.{}_mutex')}
 
 
-def orphans(paths):
-    """Return those of some shared-memory files that exist although no process uses them."""
-    left = {path for path in paths if Path(path).exists()}
-    for folder in Path('/proc').glob('[0-9]*') if left else ():
-        try:
-            left -= shared_memory_of(folder.name)
-        except OSError:     # it ended, or is another user's
-            continue
-    return left
+class SharedMemory:
+    """
+    What the middleware keeps in /dev/shm for the processes of a module.
+
+    :ivar seen: files that they were seen to own.
+    :ivar spoiled: whether one was killed, after which what it shared with others stays for ever.
+    """
+
+    def __init__(self):
+        self.seen = set()
+        self.spoiled = False
+
+    def note(self, pid):
+        """Remember what a process owns now."""
+        with suppress(OSError):     # it ended by itself
+            self.seen |= shared_memory_of(pid)
+
+    def left(self):
+        """Return the files that exist although no running process owns them."""
+        left = {path for path in self.seen if path.exists()}
+        for folder in Path('/proc').glob('[0-9]*') if left else ():
+            with suppress(OSError):     # it ended, or is another user's
+                left -= shared_memory_of(folder.name)
+        return left
+
+    def check(self):
+        """Fail if anything is left, once all have ended; after a kill remove it instead."""
+        if self.spoiled:
+            for path in self.left():
+                path.unlink(missing_ok=True)
+        # Ports from 7000 on are common to all domains: somebody else may hold them.
+        assert [path for path in self.left() if 'port70' not in path.name] == []
 
 
 class Suite:
@@ -170,18 +198,20 @@ class Suite:
     Processes of one test or module, all of which end with it.
 
     :param folder: for what they print.
+    :param shared_memory: takes note of what they own.
     """
 
-    def __init__(self, folder):
+    def __init__(self, folder, shared_memory):
         self.folder = folder
+        self._shared_memory = shared_memory
         self._started = []
-        self._before = set(map(str, Path('/dev/shm').glob('*fast*')))
 
     def start(self, name, *arguments, environment=None, **options):
         """Start `fourbar NAME ARGUMENTS`."""
         folder = self.folder / f'{len(self._started)}_{name}'
         folder.mkdir()
-        process = Process(name, arguments, environment or {}, folder, **options)
+        process = Process(
+            name, arguments, environment or {}, folder, self._shared_memory, **options)
         self._started.append(process)
         return process
 
@@ -213,13 +243,7 @@ class Suite:
         finally:
             for process in self._started:
                 if process.popen.poll() is None:
-                    process.popen.kill()
-                    process.popen.wait()
-
-    def left_behind(self):
-        """Return the shared memory that the ended processes made and nobody uses any more."""
-        return orphans(set().union(
-            *(process.shared_memory for process in self._started)) - self._before)
+                    process.kill()
 
 
 class Probe:
@@ -376,25 +400,31 @@ def domain(compiled):
 
 
 @pytest.fixture(scope='module')
-def module_suite(domain, tmp_path_factory):
-    """Run processes until the end of the module, which must leave nothing behind."""
-    suite = Suite(tmp_path_factory.mktemp('module'))
-    yield suite
-    suite.close()
-    assert suite.left_behind() == set()
-
-
-@pytest.fixture
-def suite(domain, tmp_path):
-    """Run processes until the end of the test, which must leave nothing behind."""
-    suite = Suite(tmp_path)
-    yield suite
-    suite.close()
-    assert suite.left_behind() == set()
+def shared_memory(domain):
+    """Check, when everything has ended, that it left nothing in /dev/shm."""
+    shared_memory = SharedMemory()
+    yield shared_memory
+    shared_memory.check()
 
 
 @pytest.fixture(scope='module')
-def make_probe(domain):
+def module_suite(shared_memory, tmp_path_factory):
+    """Run processes until the end of the module."""
+    suite = Suite(tmp_path_factory.mktemp('module'), shared_memory)
+    yield suite
+    suite.close()
+
+
+@pytest.fixture
+def suite(shared_memory, tmp_path):
+    """Run processes until the end of the test."""
+    suite = Suite(tmp_path, shared_memory)
+    yield suite
+    suite.close()
+
+
+@pytest.fixture(scope='module')
+def make_probe(domain, shared_memory):
     """Return a function that makes a probe, closed at the end of the module."""
     probes = []
 
@@ -402,6 +432,7 @@ def make_probe(domain):
         probes.append(Probe(domain, namespace))
         return probes[-1]
     yield make
+    shared_memory.note(os.getpid())
     for probe in probes:
         probe.close()
 
@@ -410,9 +441,3 @@ def make_probe(domain):
 def probe(make_probe):
     """Watch the module's nodes."""
     return make_probe()
-
-
-@pytest.fixture(scope='session')
-def no_shared_memory():
-    """Return the environment for a process that will be killed."""
-    return NO_SHARED_MEMORY
