@@ -162,6 +162,7 @@ def _prepare(output: Path) -> None:
 
 def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> None:
     """Start everything, arm, move, and stop everything again."""
+    from fourbar_ros.nodes.runtime import step_back
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     print(f'Starting {", ".join(NODES)}. Watch them from another terminal:\n'
           f'  ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST '
@@ -176,6 +177,7 @@ def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> N
             return condition()
         testbed.wait(checked, seconds, missing)
 
+    step_back()
     testbed.offer_setpoints()
     testbed.follow(*STATUSES)
     testbed.follow_joints(*JOINTS)

@@ -24,7 +24,7 @@ import importlib
 import time
 
 from fourbar_ros.errors import FourbarError
-from fourbar_ros.nodes.runtime import Runtime, SPIN_TIMEOUT
+from fourbar_ros.nodes.runtime import Runtime, SPIN_TIMEOUT, step_back
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
@@ -150,6 +150,7 @@ def record(directory, topics=(), *, exclude_internal=False, ros_args=(), live=Fa
     :returns: number of messages by topic.
     :raises RecorderError: it cannot start, or cannot write.
     """
+    step_back()
     runtime = Runtime(['--ros-args', *ros_args])
     try:
         writer = Writer(directory, version=9, storage_plugin=StoragePlugin.MCAP)

@@ -16,6 +16,7 @@
 
 import argparse
 import gc
+import os
 import signal
 
 from fourbar_ros.nodes.environment import RosError
@@ -113,6 +114,11 @@ def run_node(make_node, name, description, argv):
             node.destroy_node()
         runtime.shut_down()
     return 0
+
+
+def step_back():
+    """Let those who work go first: for processes that only watch, on a machine with few cores."""
+    os.nice(5)
 
 
 def _first_line(error):

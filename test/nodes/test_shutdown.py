@@ -52,10 +52,11 @@ def test_moving_testbed_ends_cleanly(suite, make_probe, number):
 
     probe.drive([1e-5] * 4)
     probe.wait(lambda: probe.arm().success)
-    for name in ('estimator', 'plant'):
-        assert nodes[name].end(number, SHUTDOWN_S) == 0
-        nodes[name].check_clean()
+    nodes['plant'].send(number)
     assert probe.status('device_status', state='disarmed')['reason'] == 'the node ends'
+    for name in ('plant', 'estimator'):
+        assert nodes[name].end(None if name == 'plant' else number, SHUTDOWN_S) == 0
+        nodes[name].check_clean()
 
 
 @pytest.mark.parametrize('name', ['plant', 'estimator', 'controller'])

@@ -1,0 +1,200 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""`fourbar arm`, `disarm`, `stop`, `reset`, `status`, `setpoint` as they are typed."""
+
+from importlib.util import module_from_spec, spec_from_file_location
+from math import radians
+from pathlib import Path
+
+from fourbar_ros.commands.setpoint import parse_goal, SetpointSyntaxError
+import pytest
+
+# Tests are no package: the harness of the node tests is loaded from its file.
+_path = Path(__file__).parents[1] / 'nodes' / 'conftest.py'
+_spec = spec_from_file_location('node_harness', _path)
+harness = module_from_spec(_spec)
+_spec.loader.exec_module(harness)
+compiled, domain, shared_memory = harness.compiled, harness.domain, harness.shared_memory
+module_suite, make_probe, probe = harness.module_suite, harness.make_probe, harness.probe
+
+COMMANDS = {'arm': [], 'disarm': [], 'stop': [], 'reset': [], 'status': [],
+            'setpoint': ['link_a=0']}
+
+
+@pytest.mark.parametrize(('text', 'goal'), [
+    ('link_a=0', ('link_a', 0.0)),
+    ('link_b=90deg', ('link_b', radians(90.0))),
+    ('link_b=-1.5e-1', ('link_b', -0.15)),
+    ('link_c=1.5rad', ('link_c', 1.5)),
+    ('anything=1', ('anything', 1.0)),
+])
+def test_goal_is_read(text, goal):
+    assert parse_goal(text) == (goal[0], pytest.approx(goal[1]))
+
+
+@pytest.mark.parametrize('text', [
+    'link_a', 'link_a=', '=1.0', 'link_a=nan', 'link_a=inf', 'link_a=90 degrees', 'link_a=deg',
+    'link_a=1,5', ''])
+def test_goal_that_cannot_be_read_is_refused(text):
+    with pytest.raises(SetpointSyntaxError, match='link_a=30deg'):
+        parse_goal(text)
+
+
+@pytest.fixture(scope='module')
+def fourbar(module_suite):
+    """Return a function that runs a command to its end: exit code, stdout, stderr."""
+    def run(name, *arguments):
+        process = module_suite.start(name, *arguments)
+        return process.end(), process.stdout, process.stderr
+    return run
+
+
+@pytest.fixture(scope='module')
+def nodes(module_suite, probe):
+    """Run a testbed in no namespace, to be watched by the probe."""
+    module_suite.nodes(controller={'setpoint_duration': 1.0})
+    probe.follow('flywheel_command')
+    probe.newest('flywheel_command')
+    return probe
+
+
+@pytest.fixture
+def testbed(nodes):
+    yield nodes
+    nodes.trigger('reset_emergency_stop')
+    nodes.arm(False)
+    nodes.status('controller_status', mode='disarmed')
+
+
+@pytest.fixture
+def armed(testbed):
+    testbed.wait(lambda: testbed.arm().success)
+    testbed.status('controller_status', mode='hold')
+    return testbed
+
+
+@pytest.fixture(scope='module')
+def without_nodes(module_suite):
+    """Run all commands at once where there is nobody, in a namespace of its own."""
+    started = {name: module_suite.start(name, *arguments, '--ros-args', '-r', '__ns:=/nobody')
+               for name, arguments in COMMANDS.items()}
+    return {name: (process.end(), process.stdout, process.stderr)
+            for name, process in started.items()}
+
+
+@pytest.mark.node
+@pytest.mark.parametrize('name', list(COMMANDS))
+def test_nobody_there_is_said_in_one_line(without_nodes, name):
+    code, out, err = without_nodes[name]
+    if name == 'status':
+        assert (code, err) == (1, '')
+        assert out.count('not found') == 2
+        return
+    assert (code, out) == (2, '')
+    line, = err.splitlines()
+    assert line.startswith(f'fourbar {name}: no device found')
+
+
+@pytest.mark.node
+def test_arm_and_disarm(testbed, fourbar):
+    assert fourbar('arm') == (0, 'armed\n', '')
+    assert testbed.status('device_status', state='armed')['reason'] == 'armed on request'
+    assert fourbar('arm') == (0, 'already armed\n', '')
+    assert fourbar('disarm') == (0, 'disarmed\n', '')
+    testbed.status('device_status', state='disarmed')
+
+
+@pytest.mark.node
+def test_stop_refused_arming_and_reset(armed, fourbar):
+    assert fourbar('stop') == (0, 'stopped, the wheels coast\n', '')
+    assert armed.status('device_status', state='emergency_stop')
+    code, out, err = fourbar('arm')
+    assert (code, out) == (1, '')
+    line, = err.splitlines()
+    assert 'emergency_stop' in line
+    assert fourbar('reset') == (0, 'emergency_stop is reset, disarmed\n', '')
+    assert fourbar('reset') == (0, 'nothing to reset: disarmed\n', '')
+    armed.status('device_status', state='disarmed')
+
+
+@pytest.mark.node
+def test_status_tells_both(armed, fourbar):
+    code, out, err = fourbar('status')
+    assert (code, err) == (0, '')
+    values = dict(line.split(maxsplit=1) for line in out.splitlines() if len(line.split()) > 1)
+    assert values['state'] == 'armed'
+    assert values['reason'] == 'armed on request'
+    assert values['mode'] == 'hold'
+    lines = out.splitlines()
+    assert lines.index('device') < lines.index('controller')
+
+
+@pytest.mark.node
+def test_setpoint_in_degrees_is_accepted(armed, fourbar):
+    assert fourbar('setpoint', 'link_a=0', 'link_b=70deg') == (0, 'accepted\n', '')
+    goal = armed.status('controller_status')['goal'].split()
+    assert float(goal[0].split('=')[1]) == pytest.approx(0.0, abs=1e-6)
+    assert float(goal[1].split('=')[1]) == pytest.approx(radians(70.0), abs=1e-6)
+
+
+@pytest.mark.node
+def test_setpoint_that_the_controller_refuses_exits_with_1(armed, fourbar):
+    code, out, err = fourbar('setpoint', 'link_x=1')
+    assert (code, out) == (1, '')
+    line, = err.splitlines()
+    assert line.startswith('refused: ')
+    assert 'link_x' in line
+
+
+@pytest.mark.node
+def test_setpoint_while_disarmed_is_refused(testbed, fourbar):
+    assert fourbar('setpoint', 'link_a=0.1') == (1, '', 'refused: the device is not armed\n')
+
+
+@pytest.mark.node
+def test_setpoint_that_cannot_be_read_never_reaches_ros(fourbar):
+    code, out, err = fourbar('setpoint', 'link_a=0', 'link_b=up')
+    assert (code, out) == (2, '')
+    line, = err.splitlines()
+    assert "'link_b=up'" in line
+
+
+@pytest.mark.node
+def test_commands_in_a_namespace(module_suite, make_probe, fourbar):
+    module_suite.nodes('/lab', controller={'setpoint_duration': 1.0})
+    watcher = make_probe('/lab')
+    watcher.follow('flywheel_command')
+    watcher.newest('flywheel_command')
+    there = ['--ros-args', '-r', '__ns:=/lab']
+    assert fourbar('arm', *there) == (0, 'armed\n', '')
+    watcher.status('device_status', state='armed')
+    watcher.status('controller_status', mode='hold')
+    assert fourbar('setpoint', 'link_a=10deg', *there) == (0, 'accepted\n', '')
+    assert watcher.status('controller_status')['accepted'] == '1'
+    code, out, err = fourbar('status', *there)
+    assert (code, err) == (0, '')
+    assert 'armed' in out
+    assert fourbar('disarm', *there)[0] == 0
+    watcher.status('device_status', state='disarmed')
+
+
+@pytest.mark.node
+@pytest.mark.parametrize('arguments', [
+    ['--ros-args', '-r', 'nonsense'], ['--ros-args', '-r', '__ns:=no name'], ['extra']])
+def test_bad_arguments_are_refused(fourbar, arguments):
+    code, out, err = fourbar('arm', *arguments)
+    assert (code, out) == (2, '')
+    assert 'Traceback' not in err
+    assert err.splitlines()[-1].startswith('fourbar')
