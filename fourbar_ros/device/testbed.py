@@ -40,6 +40,10 @@ TIMEOUT_ACTIONS = ('coast', 'hold_speed', 'brake')
 PARKING_BANDWIDTH = 30.0
 
 
+# Ticks after which an answer is no longer waited for.
+LONGEST_WAIT = 100
+
+
 @dataclass(frozen=True)
 class TestbedSettings:
     """
@@ -99,8 +103,10 @@ class Testbed:
         self._wheel_speeds = np.zeros(4)
         self._link_seen_ns: list[int | None] = [None] * 4
         self._tick_ns: int | None = None
-        # Ticks without an answer so far: when each went out, by stamp.
+        # Ticks without an answer so far: when each went out, by stamp. Those that have waited for
+        # more than a period are counted as lost, but their round trip is still told if it ends.
         self._open_ticks: dict[int, int] = {}
+        self._lost_ticks: dict[int, int] = {}
         self._step_ns = 0
         self._command_stamp_ns: int | None = None
         self._command_steady_ns: int | None = None
@@ -224,17 +230,20 @@ class Testbed:
             raise RejectedError('stale', 'stamp is older than that of the last command')
 
     def _answered(self, stamp_ns: int, steady_ns: int) -> None:
-        published_ns = self._open_ticks.pop(stamp_ns, None)
-        if published_ns is not None:
-            self._round_trip_ns = steady_ns - published_ns
+        if stamp_ns in self._open_ticks:
+            self._round_trip_ns = steady_ns - self._open_ticks.pop(stamp_ns)
             self._lost += self._round_trip_ns > self.device.period_ns
+        elif stamp_ns in self._lost_ticks:
+            self._round_trip_ns = steady_ns - self._lost_ticks.pop(stamp_ns)
 
     def _timing(self, steady_ns: int) -> Timing:
         """Report the last answer, and give up on ticks that waited for more than a period."""
         overdue = [stamp_ns for stamp_ns, published_ns in self._open_ticks.items()
                    if steady_ns - published_ns > self.device.period_ns]
         for stamp_ns in overdue:
-            del self._open_ticks[stamp_ns]
+            self._lost_ticks[stamp_ns] = self._open_ticks.pop(stamp_ns)
+        while len(self._lost_ticks) > LONGEST_WAIT:
+            del self._lost_ticks[next(iter(self._lost_ticks))]
         if self._command_stamp_ns is not None:
             self._lost += len(overdue)
         round_trip_ns, self._round_trip_ns = self._round_trip_ns, None

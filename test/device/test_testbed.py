@@ -554,3 +554,22 @@ def test_period_that_is_no_multiple_of_the_step_is_refused(paper: Mechanism) -> 
                   np.random.default_rng(0))
     with pytest.raises(PlantError, match='whole multiple'):
         SimulatedTable(plant, PERIOD_NS)
+
+
+def test_late_answer_counts_once_as_lost_and_tells_its_round_trip(operate: Operate) -> None:
+    """Two periods late, after newer ticks: p99 of the round trip must not hide it."""
+    bed = operate()
+    bed.tick()
+    bed.command(0.0)
+    asked_ns = bed.stamp_ns
+    for _ in range(3):
+        bed.tick()
+        bed.command(0.0, ahead_ns=asked_ns - bed.stamp_ns)
+    _, timing = bed.tick()
+    # Of three ticks that nobody answered two waited for more than a period by now.
+    assert timing.lost == 2
+    late_ns = bed.stamp_ns - 2 * PERIOD_NS
+    bed.command(0.0, ahead_ns=late_ns - bed.stamp_ns)
+    _, timing = bed.tick()
+    assert timing.round_trip_s == pytest.approx(2 * PERIOD_NS * 1e-9, rel=1e-12)
+    assert timing.lost == 3
