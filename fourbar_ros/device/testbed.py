@@ -163,6 +163,10 @@ class Testbed:
         limits = self.device.mechanism.motor_torque_limits
         limited = np.clip(torques, -limits, limits)
         self.clipped += bool((limited != torques).any())
+        if self._command_stamp_ns is None:
+            # Nobody was there yet to answer the ticks before this one.
+            self._open_ticks = {tick: published_ns for tick, published_ns
+                                in self._open_ticks.items() if tick >= stamp_ns}
         self._command_stamp_ns = stamp_ns
         self._command_steady_ns = steady_ns
         self._answered(stamp_ns, steady_ns)
@@ -242,10 +246,9 @@ class Testbed:
                    if steady_ns - published_ns > self.device.period_ns]
         for stamp_ns in overdue:
             self._lost_ticks[stamp_ns] = self._open_ticks.pop(stamp_ns)
+            self._lost += self._command_stamp_ns is not None
         while len(self._lost_ticks) > LONGEST_WAIT:
             del self._lost_ticks[next(iter(self._lost_ticks))]
-        if self._command_stamp_ns is not None:
-            self._lost += len(overdue)
         round_trip_ns, self._round_trip_ns = self._round_trip_ns, None
         return Timing(
             round_trip_ns * 1e-9 if round_trip_ns is not None else None,

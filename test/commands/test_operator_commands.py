@@ -18,8 +18,9 @@ from importlib.util import module_from_spec, spec_from_file_location
 from math import radians
 from pathlib import Path
 
-from fourbar_ros.commands.setpoint import parse_goal, SetpointSyntaxError
 import pytest
+
+pytestmark = pytest.mark.node
 
 # Tests are no package: the harness of the node tests is loaded from its file.
 _path = Path(__file__).parents[1] / 'nodes' / 'conftest.py'
@@ -31,25 +32,6 @@ module_suite, make_probe, probe = harness.module_suite, harness.make_probe, harn
 
 COMMANDS = {'arm': [], 'disarm': [], 'stop': [], 'reset': [], 'status': [],
             'setpoint': ['link_a=0']}
-
-
-@pytest.mark.parametrize(('text', 'goal'), [
-    ('link_a=0', ('link_a', 0.0)),
-    ('link_b=90deg', ('link_b', radians(90.0))),
-    ('link_b=-1.5e-1', ('link_b', -0.15)),
-    ('link_c=1.5rad', ('link_c', 1.5)),
-    ('anything=1', ('anything', 1.0)),
-])
-def test_goal_is_read(text, goal):
-    assert parse_goal(text) == (goal[0], pytest.approx(goal[1]))
-
-
-@pytest.mark.parametrize('text', [
-    'link_a', 'link_a=', '=1.0', 'link_a=nan', 'link_a=inf', 'link_a=90 degrees', 'link_a=deg',
-    'link_a=1,5', ''])
-def test_goal_that_cannot_be_read_is_refused(text):
-    with pytest.raises(SetpointSyntaxError, match='link_a=30deg'):
-        parse_goal(text)
 
 
 @pytest.fixture(scope='module')
@@ -94,7 +76,6 @@ def without_nodes(module_suite):
             for name, process in started.items()}
 
 
-@pytest.mark.node
 @pytest.mark.parametrize('name', list(COMMANDS))
 def test_nobody_there_is_said_in_one_line(without_nodes, name):
     code, out, err = without_nodes[name]
@@ -107,7 +88,6 @@ def test_nobody_there_is_said_in_one_line(without_nodes, name):
     assert line.startswith(f'fourbar {name}: no device found')
 
 
-@pytest.mark.node
 def test_arm_and_disarm(testbed, fourbar):
     assert fourbar('arm') == (0, 'armed\n', '')
     assert testbed.status('device_status', state='armed')['reason'] == 'armed on request'
@@ -116,7 +96,6 @@ def test_arm_and_disarm(testbed, fourbar):
     testbed.status('device_status', state='disarmed')
 
 
-@pytest.mark.node
 def test_stop_refused_arming_and_reset(armed, fourbar):
     assert fourbar('stop') == (0, 'stopped, the wheels coast\n', '')
     assert armed.status('device_status', state='emergency_stop')
@@ -129,7 +108,6 @@ def test_stop_refused_arming_and_reset(armed, fourbar):
     armed.status('device_status', state='disarmed')
 
 
-@pytest.mark.node
 def test_status_tells_both(armed, fourbar):
     code, out, err = fourbar('status')
     assert (code, err) == (0, '')
@@ -141,7 +119,6 @@ def test_status_tells_both(armed, fourbar):
     assert lines.index('device') < lines.index('controller')
 
 
-@pytest.mark.node
 def test_setpoint_in_degrees_is_accepted(armed, fourbar):
     assert fourbar('setpoint', 'link_a=0', 'link_b=70deg') == (0, 'accepted\n', '')
     goal = armed.status('controller_status')['goal'].split()
@@ -149,7 +126,6 @@ def test_setpoint_in_degrees_is_accepted(armed, fourbar):
     assert float(goal[1].split('=')[1]) == pytest.approx(radians(70.0), abs=1e-6)
 
 
-@pytest.mark.node
 def test_setpoint_that_the_controller_refuses_exits_with_1(armed, fourbar):
     code, out, err = fourbar('setpoint', 'link_x=1')
     assert (code, out) == (1, '')
@@ -158,12 +134,10 @@ def test_setpoint_that_the_controller_refuses_exits_with_1(armed, fourbar):
     assert 'link_x' in line
 
 
-@pytest.mark.node
 def test_setpoint_while_disarmed_is_refused(testbed, fourbar):
     assert fourbar('setpoint', 'link_a=0.1') == (1, '', 'refused: the device is not armed\n')
 
 
-@pytest.mark.node
 def test_setpoint_that_cannot_be_read_never_reaches_ros(fourbar):
     code, out, err = fourbar('setpoint', 'link_a=0', 'link_b=up')
     assert (code, out) == (2, '')
@@ -171,7 +145,6 @@ def test_setpoint_that_cannot_be_read_never_reaches_ros(fourbar):
     assert "'link_b=up'" in line
 
 
-@pytest.mark.node
 def test_commands_in_a_namespace(module_suite, make_probe, fourbar):
     module_suite.nodes('/lab', controller={'setpoint_duration': 1.0})
     watcher = make_probe('/lab')
@@ -190,11 +163,11 @@ def test_commands_in_a_namespace(module_suite, make_probe, fourbar):
     watcher.status('device_status', state='disarmed')
 
 
-@pytest.mark.node
 @pytest.mark.parametrize('arguments', [
     ['--ros-args', '-r', 'nonsense'], ['--ros-args', '-r', '__ns:=no name'], ['extra']])
 def test_bad_arguments_are_refused(fourbar, arguments):
     code, out, err = fourbar('arm', *arguments)
     assert (code, out) == (2, '')
     assert 'Traceback' not in err
-    assert err.splitlines()[-1].startswith('fourbar')
+    line, = [line for line in err.splitlines() if line.startswith('fourbar arm: ')
+             or 'unrecognized arguments' in line]

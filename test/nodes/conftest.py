@@ -308,6 +308,7 @@ class Probe:
     def status(self, topic, **wanted):
         """Follow a latched status until it has some values, and return all of them."""
         received = self.follow(topic, kind=DiagnosticStatus, qos=LATCHED)
+        self.catch_up()
         self.wait(lambda: received and wanted.items() <= values_of(received[-1]).items())
         return values_of(received[-1])
 

@@ -1,0 +1,108 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Launch files, as far as they can be checked where there may be no launch."""
+
+import ast
+from pathlib import Path
+
+from fourbar_ros.nodes.tables import TABLES
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
+
+each_file = pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
+
+
+def tree_of(path):
+    return ast.parse(path.read_text(), filename=str(path))
+
+
+def calls(path, name):
+    """Return the calls of a name: their first positional argument and their keywords."""
+    found = []
+    for node in ast.walk(tree_of(path)):
+        if isinstance(node, ast.Call) and getattr(node.func, 'id', None) == name:
+            found.append((node.args[0] if node.args else None,
+                          {keyword.arg: keyword.value for keyword in node.keywords}))
+    return found
+
+
+def constants(path):
+    """Return the module's constants, which may be made of one another."""
+    values = {'str': str, 'float': float, 'int': int, 'bool': bool}
+    for node in tree_of(path).body:
+        if isinstance(node, ast.Assign):
+            code = compile(ast.Expression(node.value), str(path), 'eval')
+            values[node.targets[0].id] = eval(code, {'__builtins__': {}}, values)
+    return values
+
+
+def arguments(path):
+    """Return the declared launch arguments: name, default and description."""
+    return {ast.literal_eval(name): {key: ast.literal_eval(value) for key, value in given.items()}
+            for name, given in calls(path, 'DeclareLaunchArgument')}
+
+
+def test_there_is_one_for_the_simulation():
+    assert [path.name for path in FILES] == ['sim.launch.py']
+
+
+@each_file
+def test_it_compiles_and_describes(path):
+    compile(path.read_text(), str(path), 'exec')
+    names = [node.name for node in tree_of(path).body if isinstance(node, ast.FunctionDef)]
+    assert 'generate_launch_description' in names
+
+
+@each_file
+def test_every_executable_exists(path):
+    assert {ast.literal_eval(given['package']) for _, given in calls(path, 'Node')} == {
+        'fourbar_ros'}
+    executables = constants(path)['EXECUTABLES']
+    assert executables
+    for name in executables:
+        assert (ROOT / 'scripts' / name).exists()
+        assert name in TABLES
+
+
+@each_file
+def test_every_argument_is_described(path):
+    found = arguments(path)
+    assert found
+    for name, given in found.items():
+        assert (name, bool(given.get('description', '').strip())) == (name, True)
+        assert 'default_value' in given
+
+
+@each_file
+def test_arguments_that_set_parameters_fit_the_tables(path):
+    """Each named node has such a parameter, of the type that it is turned into."""
+    for name, (nodes, kind) in constants(path)['PARAMETERS'].items():
+        assert name in arguments(path)
+        for node in nodes:
+            row = next(row for row in TABLES[node] if row.name == name)
+            assert (name, type(row.default)) == (name, kind)
+
+
+@each_file
+def test_launch_takes_it(path):
+    pytest.importorskip('launch_ros')
+    from launch.actions import DeclareLaunchArgument
+    from launch.launch_description_sources import get_launch_description_from_python_launch_file
+    description = get_launch_description_from_python_launch_file(str(path))
+    declared = {entity.name for entity in description.entities
+                if isinstance(entity, DeclareLaunchArgument)}
+    assert declared == set(arguments(path))
