@@ -24,6 +24,7 @@ from fourbar_ros.nodes.messages import (
     LATCHED,
     OK,
     RareLog,
+    Recently,
     RELIABLE,
     SENSOR,
     stamp_of,
@@ -60,7 +61,7 @@ class ControllerNode(Node):
         mechanism = load_mechanism(values['mechanism'])
         self._controller = Controller(mechanism, _settings(values))
         self._pairs = StampPairs()
-        self._log = RareLog(self)
+        self._log, self._refused = RareLog(self), Recently()
         self._announced = None
         self._judged = ''
         self._last_stamp_ns = None
@@ -150,7 +151,7 @@ class ControllerNode(Node):
                   'ticks_saturated': controller.saturated}
         if self._last_stamp_ns is None:
             return WARN, 'waiting for flywheel_states and estimate/link_states', values
-        if controller.refused:
+        if self._refused.grew(controller.refused):
             return WARN, f'{controller.mode}, setpoints were refused', values
         return OK, controller.mode, values
 

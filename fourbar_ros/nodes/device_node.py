@@ -31,6 +31,7 @@ from fourbar_ros.nodes.messages import (
     LATCHED,
     OK,
     RareLog,
+    Recently,
     RELIABLE,
     stamp_of,
     status_message,
@@ -78,7 +79,7 @@ class DeviceNode(Node):
         self._mechanism = values['mechanism']
         self._testbed = Testbed(make_device(values, period_ns), TestbedSettings(
             values['command_timeout'], values['sensor_timeout'], values['timeout_action']))
-        self._log = RareLog(self)
+        self._log, self._rejected = RareLog(self), Recently()
 
         self._links = JointStatePublisher(
             self, 'link_angles', LINK_NAMES, ('position',), frame=TABLE_FRAME)
@@ -173,6 +174,6 @@ class DeviceNode(Node):
     def _collect(self):
         gate = self._testbed.gate
         level, summary = LEVELS[gate.state], gate.state.value
-        if self._testbed.rejected and level == OK:
+        if self._rejected.grew(self._testbed.rejected.total()) and level == OK:
             level, summary = WARN, f'{summary}, commands were rejected'
         return level, summary, {**self._testbed.diagnosis(), 'ticks_skipped': self._pace.skipped}

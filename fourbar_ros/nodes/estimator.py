@@ -22,6 +22,7 @@ from fourbar_ros.nodes.messages import (
     JointStatePublisher,
     OK,
     RareLog,
+    Recently,
     SENSOR,
     stamp_of,
     TABLE_FRAME,
@@ -52,7 +53,7 @@ class EstimatorNode(Node):
         values = declare(self, PARAMETERS)
         self._estimator = Estimator(
             load_mechanism(values.pop('mechanism')), EstimatorSettings(**values))
-        self._log = RareLog(self)
+        self._log, self._rejected = RareLog(self), Recently()
         self._states = JointStatePublisher(
             self, 'estimate/link_states', LINK_NAMES, frame=TABLE_FRAME)
         self._sigma = JointStatePublisher(self, 'estimate/sigma', LINK_NAMES)
@@ -101,7 +102,7 @@ class EstimatorNode(Node):
                       for kind, count in sorted(estimator.rejected.items()))
         if estimator.waiting_for:
             return WARN, f'waiting for {estimator.waiting_for}', values
-        if estimator.rejected:
+        if self._rejected.grew(estimator.rejected.total()):
             return WARN, 'running, measurements were rejected', values
         return OK, 'running', values
 

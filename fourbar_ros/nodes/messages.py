@@ -32,6 +32,9 @@ TABLE_FRAME = 'table'
 # A message on a wrong input at most so often [s].
 LOG_PERIOD = 1.0
 
+# How long a rejected message keeps a node's diagnostics at warning [s]; it stays counted.
+RECENT = 10.0
+
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -126,6 +129,20 @@ class Diagnostics:
         array.header.stamp = self._node.get_clock().now().to_msg()
         array.status = [status_message(self._node, self._hardware, level, summary, values)]
         self._publisher.publish(array)
+
+
+class Recently:
+    """Tell whether a counter grew within the last RECENT seconds."""
+
+    def __init__(self):
+        self._count = 0
+        self._grew_ns = None
+
+    def grew(self, count):
+        """Take the present count."""
+        if count != self._count:
+            self._count, self._grew_ns = count, steady_ns()
+        return self._grew_ns is not None and steady_ns() - self._grew_ns < RECENT * 1e9
 
 
 class RareLog:
