@@ -14,13 +14,10 @@
 
 """The recorder over real DDS: what is published is in the bag, whatever happens."""
 
-import fcntl
 import os
-from pathlib import Path
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -37,27 +34,8 @@ from sensor_msgs.msg import JointState
 
 pytestmark = pytest.mark.node
 
-DOMAINS = range(60, 70)
 DEADLINE_S = 20.0
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-@pytest.fixture
-def domain(monkeypatch):
-    """Take a domain that no other test run on this machine uses."""
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    for number in DOMAINS:
-        lock = Path(tempfile.gettempdir(), f'fourbar_ros_domain_{number}.lock').open('w')
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.close()
-            continue
-        monkeypatch.setenv('ROS_DOMAIN_ID', str(number))
-        yield number
-        lock.close()
-        return
-    pytest.fail('every domain is taken')
 
 
 @pytest.fixture

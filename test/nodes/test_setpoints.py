@@ -37,10 +37,10 @@ WRONG = {
     'unknown': ([['link_x'], [0.0]], 'link_x'),
     'wheel': ([['flywheel_a'], [0.0]], 'flywheel_a'),
     'twice': ([['link_a', 'link_a'], [0.0, 0.0]], 'twice'),
-    'too few': ([['link_a', 'link_b'], [0.0]], '2 names but 1 positions'),
-    'too many': ([['link_a'], [0.0, 0.0]], '1 names but 2 positions'),
-    'empty': ([[], []], 'no link'),
-    'nameless': ([[], [0.0, 1.57]], 'no link'),
+    'too few': ([['link_a', 'link_b'], [0.0]], '2 names but 1'),
+    'too many': ([['link_a'], [0.0, 0.0]], '1 names but 2'),
+    'empty': ([[], []], 'is named'),
+    'nameless': ([[], [0.0, 1.57]], 'is named'),
     'contradictory': ([['link_a', 'link_b', 'link_c'], [0.0, 1.2, 0.5]], 'link_c'),
 }
 
