@@ -55,7 +55,7 @@ def check_environment():
         raise RosError(f'rclpy {found} in {where} is not that of ROS 2 Jazzy ({oldest} or a later '
                        f'{OLDEST_RCLPY[0]}): is another ROS sourced?')
     domain = os.environ.get('ROS_DOMAIN_ID', '')
-    if domain and not (domain.isdigit() and int(domain) <= LARGEST_DOMAIN):
+    if domain and not (domain.isascii() and domain.isdigit() and int(domain) <= LARGEST_DOMAIN):
         raise RosError(f'ROS_DOMAIN_ID must be a whole number from 0 to {LARGEST_DOMAIN}, '
                        f'not {domain!r}')
     middleware = os.environ.get('RMW_IMPLEMENTATION', '')

@@ -97,7 +97,10 @@ def run_node(make_node, name, description, argv):
         epilog='Parameters (-p name:=value, --params-file FILE), remapping (-r) and namespace '
                '(-r __ns:=/lab) follow --ros-args. docs/topics.md lists topics and parameters, '
                'with units.')
-    ros_free = remove_ros_args(args=[name, *argv])[1:]
+    try:
+        ros_free = remove_ros_args(args=[name, *argv])[1:]
+    except Exception as error:  # noqa: BLE001 - rcl's errors have no common class
+        raise RosError(_first_line(error)) from None
     parser.parse_args(ros_free)
     runtime = Runtime(argv)
     node = None
