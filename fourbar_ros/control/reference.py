@@ -57,6 +57,12 @@ class SoftStep:
         values: Array = scaling[:, None] * (powers @ self._coefficients())
         return values
 
+    def path(self, count: int) -> Array:
+        """Sample the angles evenly in time, both ends included: (count, 2) [rad]."""
+        powers = np.linspace(0.0, 1.0, count)[:, None] ** np.arange(6)
+        angles: Array = powers @ self._coefficients()
+        return angles
+
     def _coefficients(self) -> Array:
         """Return the polynomial's coefficients in time / duration: (6, 2)."""
         angle = self.start[0]

@@ -21,10 +21,10 @@ from math import sin
 
 from fourbar_ros.control.reference import SoftStep
 from fourbar_ros.errors import FourbarError
-from fourbar_ros.mechanism import ClosureError, LINK_NAMES, Mechanism, nearest_assembly
+from fourbar_ros.mechanism import ClosureError, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.angles import wrap
 from fourbar_ros.mechanism.by_name import RejectedError, values_by_name
-from fourbar_ros.mechanism.closure import assemblies
+from fourbar_ros.mechanism.closure import assemble_along, assemblies
 from fourbar_ros.mechanism.parameters import Array
 import numpy as np
 
@@ -120,19 +120,18 @@ def follow(mechanism: Mechanism, move: SoftStep, present: Array) -> Array:
     """
     # Keeping the distance, or moving away, is always allowed, whatever rounding says.
     limit = min(CHANGE_POINT_MARGIN, abs(sin(present[3] - present[2]))) - ROUNDING
-    angles = present
-    for time in np.linspace(0.0, move.duration, CHECKS):
-        phi_a, phi_b = move.at(float(time))[0]
-        try:
-            angles = nearest_assembly(mechanism, (0, 1), (phi_a, phi_b), angles)
-        except ClosureError as error:
-            raise SetpointError(f'on the way there {error}') from None
-        fold = abs(sin(angles[3] - angles[2]))
-        if fold < limit:
-            raise SetpointError(
-                f'on the way there link_c and link_d fold onto a line (|sin| = {fold:.3f}, limit '
-                f'{CHANGE_POINT_MARGIN:g}), a change point')
-    return angles
+    way = move.path(CHECKS)
+    try:
+        angles = assemble_along(mechanism, way[:, 0], way[:, 1], present)
+    except ClosureError as error:
+        raise SetpointError(f'on the way there {error}') from None
+    fold = float(np.abs(np.sin(angles[:, 3] - angles[:, 2])).min())
+    if fold < limit:
+        raise SetpointError(
+            f'on the way there link_c and link_d fold onto a line (|sin| = {fold:.3f}, limit '
+            f'{CHANGE_POINT_MARGIN:g}), a change point')
+    end: Array = angles[-1]
+    return end
 
 
 def _check_end(reached: Array, goals: dict[int, float]) -> None:

@@ -118,6 +118,38 @@ def assemblies(
     return sorted(completed, key=lambda result: float(np.abs(result - reference).sum()))
 
 
+def assemble_along(mechanism: Mechanism, phi_a: Array, phi_b: Array, start: ArrayLike) -> Array:
+    """
+    Follow the linkage along a path of two link angles, joint 3 staying on its side.
+
+    :param phi_a, phi_b: (n,) the path [rad].
+    :param start: (4,) link angles where it begins [rad].
+    :returns: (n, 4) link angles, continuous with the start [rad].
+    :raises ClosureError: the loop cannot close somewhere on the path.
+    """
+    begin = np.asarray(start, dtype=float)
+    l_a, l_b, l_c, l_d = mechanism.link_lengths
+    # From joint 2 to joint 4: l_c e_c - l_d e_d.
+    gap_x = l_a * np.cos(phi_a) - l_b * np.cos(phi_b)
+    gap_y = l_a * np.sin(phi_a) - l_b * np.sin(phi_b)
+    gap = np.hypot(gap_x, gap_y)
+    short, long = abs(l_c - l_d), l_c + l_d
+    open_loop = (gap < short * (1.0 - 1e-12)) | (gap > long * (1.0 + 1e-12)) | (gap == 0.0)
+    if open_loop.any():
+        n = int(np.argmax(open_loop))
+        raise ClosureError(
+            f'the loop cannot close at link_a = {phi_a[n]:.4f} rad and link_b = {phi_b[n]:.4f} '
+            f'rad: link_c and link_d reach {short:g} to {long:g} m, needed are {gap[n]:g} m')
+    side = 1.0 if sin(begin[3] - begin[2]) >= 0.0 else -1.0
+    cosine = (gap * gap + l_c * l_c - l_d * l_d) / (2.0 * gap * l_c)
+    phi_c = np.arctan2(gap_y, gap_x) + side * np.arccos(np.clip(cosine, -1.0, 1.0))
+    phi_d = np.arctan2(l_c * np.sin(phi_c) - gap_y, l_c * np.cos(phi_c) - gap_x)
+    path = np.vstack([begin, np.column_stack([phi_a, phi_b, phi_c, phi_d])])
+    followed: Array = np.unwrap(path, axis=0)[1:]
+    followed[:, 0], followed[:, 1] = phi_a, phi_b
+    return followed
+
+
 def solve_pair(
     mechanism: Mechanism, known: tuple[int, int], angles: tuple[float, float],
 ) -> list[Array]:

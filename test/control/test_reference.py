@@ -85,3 +85,10 @@ def test_rate_and_acceleration_are_the_derivatives(
 def test_before_its_begin_it_stays_at_the_start() -> None:
     moving = np.array([[0.2, -1.0], [0.3, 0.1], [0.05, -0.2]])
     np.testing.assert_allclose(SoftStep(moving, GOAL, 5.0).at(-1.0), moving, rtol=1e-15)
+
+
+def test_path_is_the_motion_sampled_evenly() -> None:
+    step = SoftStep(np.array([[0.1, -0.2], [0.3, 0.1], [-0.1, 0.2]]), np.array([1.0, 2.0]), 3.0)
+    np.testing.assert_allclose(
+        step.path(31), [step.at(time)[0] for time in np.linspace(0.0, 3.0, 31)],
+        rtol=0.0, atol=1e-13)

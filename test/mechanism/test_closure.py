@@ -25,7 +25,7 @@ from fourbar_ros.mechanism import (
     Mechanism,
     nearest_assembly,
 )
-from fourbar_ros.mechanism.closure import BRANCHES, solve_pair, wrap
+from fourbar_ros.mechanism.closure import assemble_along, BRANCHES, solve_pair, wrap
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -255,3 +255,26 @@ def test_angles_worked_out_lie_in_one_turn(phi_a: float, phi_b: float, branch: s
     angles = assemble(linkage((0.1,) * 4), phi_a, phi_b, branch)
     assert -pi < angles[2] <= pi
     assert -pi < angles[3] <= pi
+
+
+@given(drawn=assembled(), turn=st.floats(-20.0, 20.0), change=st.floats(-0.02, 0.02))
+@repeatable
+def test_path_is_followed_as_step_by_step(
+    drawn: tuple[Mechanism, Array, str], turn: float, change: float,
+) -> None:
+    """Turn by several turns while the configuration changes a little."""
+    mechanism, start, _ = drawn
+    share = np.linspace(0.0, 1.0, 300)
+    phi_a, phi_b = start[0] + turn * share, start[1] + (turn + change) * share
+    followed = assemble_along(mechanism, phi_a, phi_b, start)
+    angles = start
+    for n in range(share.size):
+        angles = nearest_assembly(mechanism, (0, 1), (phi_a[n], phi_b[n]), angles)
+        np.testing.assert_allclose(followed[n], angles, rtol=0.0, atol=20.0 * EXACT)
+
+
+def test_path_that_opens_the_loop_is_refused_where_it_does() -> None:
+    mechanism = linkage((0.3, 0.2, 0.2, 0.2))
+    start = assemble(mechanism, 0.0, 1.0)
+    with pytest.raises(ClosureError, match=r'cannot close at link_a = 0\.0000 rad'):
+        assemble_along(mechanism, np.zeros(50), np.linspace(1.0, pi, 50), start)
