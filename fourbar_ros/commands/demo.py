@@ -20,6 +20,7 @@ import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, ExitStack
 import fcntl
+import gc
 from math import degrees, pi
 import os
 from pathlib import Path
@@ -59,10 +60,10 @@ TABLE = (
 )
 
 # Times [s]: to look for another plant, for everything to come up, to settle before and after.
-LOOK_AROUND = 0.5
+LOOK_AROUND = 0.3
 START_UP = 30.0
-SETTLE_BEFORE = 0.5
-SETTLE_AFTER = 1.2
+SETTLE_BEFORE = 0.3
+SETTLE_AFTER = 1.1
 
 EPILOG = """\
 Uses the ROS_DOMAIN_ID of the environment (default 0) with discovery on this machine alone.
@@ -97,7 +98,6 @@ def run(args: argparse.Namespace) -> int:
     with TestbedClient() as testbed, ExitStack() as stack:
         # Once here, or three nodes would do it side by side; meanwhile others are discovered.
         compile_kernels()
-        import fourbar_ros.analysis.figures  # noqa: F401
         _refuse_second_plant(testbed)
         stack.enter_context(_locked(args.output))
         _prepare(args.output)
@@ -107,6 +107,8 @@ def run(args: argparse.Namespace) -> int:
     metrics = write_report(args.output / 'bag', args.output / 'report.html',
                            args.output / 'metrics.json')
     _print_table(metrics)
+    # What is left is the interpreter's end: it need not look for garbage in all of matplotlib.
+    gc.freeze()
     print(f'Report   {args.output / "report.html"}')
     return 0
 
@@ -170,6 +172,8 @@ def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> N
     processes.start('record', ['-o', str(bag)])
     for name in NODES:
         processes.start(name)
+    # What the report needs, loaded while there is nothing to do but wait.
+    import fourbar_ros.analysis.figures  # noqa: F401
 
     def until(condition: Callable[[], bool], missing: str, seconds: float = START_UP) -> None:
         def checked() -> bool:
@@ -211,8 +215,7 @@ def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> N
             return bool(elapsed >= duration)
         until(arrived, 'the motion did not end', 3.0 * duration)
     testbed.arm(False)
-    processes.stop('controller')
-    processes.stop('estimator', 'plant')
+    processes.stop(*NODES)
     processes.stop('record')
 
 
