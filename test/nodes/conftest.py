@@ -16,6 +16,7 @@
 
 from contextlib import contextmanager, suppress
 import fcntl
+import gc
 import os
 from pathlib import Path
 import signal
@@ -312,6 +313,11 @@ class Probe:
         self.wait(lambda: received and wanted.items() <= values_of(received[-1]).items())
         return values_of(received[-1])
 
+    def state(self):
+        """Return the newest state of the device, None before the first."""
+        received = self.follow('device_status', kind=DiagnosticStatus, qos=LATCHED)
+        return values_of(received[-1])['state'] if received else None
+
     def diagnosis(self, node, condition=lambda status: True):
         """Wait for a new status of a node on /diagnostics that fulfils a condition."""
         arrays = self.follow('/diagnostics', kind=DiagnosticArray)
@@ -428,6 +434,9 @@ def suite(shared_memory, tmp_path):
 def make_probe(domain, shared_memory):
     """Return a function that makes a probe, closed at the end of the module."""
     probes = []
+    # A full search for garbage in all that pytest has imported outlasts a command timeout.
+    gc.collect()
+    gc.freeze()
 
     def make(namespace=''):
         probes.append(Probe(domain, namespace))

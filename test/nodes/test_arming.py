@@ -77,6 +77,18 @@ def spinning(testbed, minimum=10.0):
     return min(np.abs(testbed.received['sim/flywheel_states'][-1].velocity)) > minimum
 
 
+def spin_up(testbed):
+    """Drive until every wheel turns; arm again if this process was held up for too long."""
+    testbed.drive(SPIN_UP)
+
+    def turning():
+        state = testbed.state()
+        if state == 'disarmed':
+            testbed.arm()
+        return state == 'armed' and spinning(testbed)
+    testbed.wait(turning)
+
+
 def refusal(testbed):
     """Ask for arming until it is refused, and return the reason."""
     def refused():
@@ -106,8 +118,7 @@ def test_armed_and_disarmed_on_request(testbed):
     status = testbed.status('device_status', state='armed')
     assert status['reason'] == 'armed on request'
     assert testbed.arm().success
-    testbed.drive(SPIN_UP)
-    testbed.wait(lambda: spinning(testbed))
+    spin_up(testbed)
 
     assert testbed.arm(False).success
 
@@ -138,8 +149,7 @@ def test_status_goes_to_diagnostics_at_once(testbed):
 
 def test_emergency_stop_is_latched_until_reset(testbed):
     testbed.arm()
-    testbed.drive(SPIN_UP)
-    testbed.wait(lambda: spinning(testbed))
+    spin_up(testbed)
 
     assert testbed.trigger('emergency_stop').success
 
@@ -210,8 +220,7 @@ def test_all_obstacles_are_named(testbed):
 
 def test_wheels_coast_when_commands_stay_away(testbed):
     testbed.arm()
-    testbed.drive(SPIN_UP)
-    testbed.wait(lambda: spinning(testbed))
+    spin_up(testbed)
 
     testbed.drive(None)
 
@@ -238,7 +247,7 @@ def test_timeout_action(suite, make_probe, action):
     testbed.follow('flywheel_states', 'sim/flywheel_states', 'sim/link_states')
     testbed.newest('sim/flywheel_states')
     arm_when_possible(testbed)
-    testbed.wait(lambda: spinning(testbed))
+    spin_up(testbed)
 
     testbed.drive(None)
 
