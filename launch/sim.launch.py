@@ -15,7 +15,7 @@
 """
 Simulated table, estimator and controller: `ros2 launch fourbar_ros sim.launch.py`.
 
-The numerical kernels are compiled first (some ten seconds, once), then the nodes start.
+The numerical kernels are compiled first (some fifteen seconds, once), then the nodes start.
 """
 
 from launch import LaunchDescription
