@@ -20,6 +20,7 @@ from pathlib import Path
 import sys
 import time
 
+from fourbar_ros.commands.ros import add_ros_arguments
 from fourbar_ros.errors import FourbarError
 
 
@@ -34,9 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--exclude-internal', action='store_true',
         help='leave out /rosout and /parameter_events')
-    parser.add_argument(
-        '--ros-args', nargs=argparse.REMAINDER, default=[],
-        help='ROS arguments, for instance -r __ns:=/lab')
+    add_ros_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
