@@ -18,11 +18,12 @@ CLEAR_BUILD := rm -rf build *.egg-info
 # Carries the time when the last complete install began; without it .venv is built anew.
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help install demo test lint clean
+.PHONY: help install demo bench test lint clean
 
 help:
 	@echo 'make install   build .venv and install the package into it'
 	@echo 'make demo      run the simulated testbed, closed loop'
+	@echo 'make bench     time the mechanics beside MuJoCo, numbers in bench.json'
 	@echo 'make test      run all tests           (ARGS="-k closure" for some of them)'
 	@echo 'make lint      check style and types'
 	@echo 'make clean     remove .venv and everything else that was built'
@@ -31,6 +32,9 @@ install: $(INSTALLED)
 
 demo: $(INSTALLED)
 	@$(VENV)/bin/fourbar demo $(ARGS)
+
+bench: $(INSTALLED)
+	@$(VENV)/bin/fourbar bench --json bench.json $(ARGS)
 
 test: $(INSTALLED)
 	@$(VENV)/bin/pytest $(ARGS)

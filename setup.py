@@ -37,10 +37,11 @@ EXTRAS = {
         'colcon-ros>=0.5',
         'colcon-test-result',
         'hypothesis',
+        'mujoco>=3.4',
         'mypy',
         'pytest',
         'ruff',
-        'sympy',
+        'sympy>=1.13',
         'types-PyYAML',
     ],
     # colcon runs the tests with pytest only where this extra names it.
@@ -83,6 +84,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
         files('config'),
+        files('config/reference'),
         files('launch'),
         # Where `ros2 run` looks. Each is a link to the one stub _run, named for what it runs.
         (f'lib/{PACKAGE}', sorted(glob('scripts/[!_]*'))),

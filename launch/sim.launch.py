@@ -35,6 +35,8 @@ EXECUTABLES = ('plant', 'estimator', 'controller')
 PARAMETERS = {
     'mechanism': (EXECUTABLES, str),
     'table': (('plant',), str),
+    'clock': (('plant',), str),
+    'real_time_factor': (('plant',), float),
     'rate': (('plant',), float),
     'seed': (('plant',), int),
     'setpoint_duration': (('controller',), float),
@@ -58,6 +60,14 @@ def generate_launch_description():
             'table', default_value='',
             description='table preset (ideal) or path of a table file; empty: as in params_file'),
         DeclareLaunchArgument(
+            'clock', default_value='',
+            description='what the ticks follow: realtime, fast or lockstep; fast and lockstep '
+                        'set use_sim_time for all nodes; empty: as in params_file'),
+        DeclareLaunchArgument(
+            'real_time_factor', default_value='',
+            description='simulated seconds per second of the fast clock, 1.0 unless given, 0.0 '
+                        'for as fast as it can'),
+        DeclareLaunchArgument(
             'rate', default_value='',
             description='control rate [Hz], 250.0 unless given here or in params_file'),
         DeclareLaunchArgument(
@@ -78,6 +88,8 @@ def _start(context):
     for executable in EXECUTABLES:
         given = {name: kind(argument(name)) for name, (owners, kind) in PARAMETERS.items()
                  if executable in owners and argument(name)}
+        if argument('clock'):
+            given['use_sim_time'] = argument('clock') != 'realtime'
         files = [argument('params_file')] if argument('params_file') else []
         nodes.append(Node(
             package='fourbar_ros', executable=executable, namespace=argument('namespace'),

@@ -14,11 +14,22 @@
 
 """Documents that are made from the code, or that people type from, say what is true."""
 
+from collections.abc import Mapping
+from dataclasses import fields, MISSING
+from math import inf, nextafter
 from pathlib import Path
 import re
+from typing import Any
 
 from fourbar_ros.commands.main import COMMANDS
+from fourbar_ros.configuration import config_file, load_yaml
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism
 from fourbar_ros.nodes.tables import markdown_text, yaml_text
+from fourbar_ros.plant.faults import FaultKind, SENSOR_FAULTS, WHEEL_FAULTS
+from fourbar_ros.plant.ledger import Ledger
+from fourbar_ros.plant.schedule import parse_schedule, read_schedule
+from fourbar_ros.plant.table import SECTIONS
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -52,3 +63,104 @@ def test_commands_exist(page: Path) -> None:
              for name in re.findall(r'^(?:ros2 run fourbar_ros|fourbar) ([a-z]\w*)', block,
                                     re.MULTILINE)}
     assert names <= {*COMMANDS, 'fourbar'}
+
+
+Rows = dict[str, list[str]]
+
+
+def table_under(heading: str) -> Rows:
+    """Return the first table below a heading of table.md: other cells by that of the key."""
+    text = (ROOT / 'docs' / 'table.md').read_text()
+    below = text.split(f'\n{heading}\n', 1)[1]
+    block = re.search(r'(?:^\|.*\|\n)+', below, re.MULTILINE)
+    assert block is not None
+    rows = [[cell.strip() for cell in line.strip('|').split('|')]
+            for line in block.group().splitlines()[2:]]
+    return {row[0].strip('`'): row[1:] for row in rows}
+
+
+def number(cell: str) -> Any:
+    """Read a cell: a number, or anything else as text."""
+    try:
+        return float(cell)
+    except ValueError:
+        return cell.strip('`')
+
+
+@pytest.mark.parametrize('section', list(SECTIONS))
+def test_keys_of_a_table_file_are_told(section: str) -> None:
+    """All of them and no other, with defaults and the values of the presets."""
+    told = table_under(f'### `{section}`')
+    keys = {item.name: item.default for item in fields(SECTIONS[section])}
+    assert list(told) == list(keys)
+    presets = [load_yaml(config_file('table', name))[section] if section in load_yaml(
+        config_file('table', name)) else {} for name in ('ideal', 'prototype')]
+    for key, default in keys.items():
+        values = ['' if value is MISSING else str(value).lower() if isinstance(value, bool)
+                  else value for value in (default, *(preset.get(key, '') for preset in presets))]
+        assert [number(cell) for cell in told[key][2:5]] == values, key
+
+
+@pytest.mark.parametrize('section', list(SECTIONS))
+def test_allowed_values_of_a_table_file_are_told(section: str) -> None:
+    """The ends of each range are taken, and what lies just beyond is refused by name."""
+    made = SECTIONS[section]
+    given = {item.name: 0 for item in fields(made) if item.default is MISSING}
+    for key, (_, allowed, *_) in table_under(f'### `{section}`').items():
+        match = re.fullmatch(r'(from |above )?(-?[\d.e-]+)(?: to ([\d.]+))?', allowed)
+        if match is None:
+            continue
+        low, high = float(match[2]), float(match[3] or inf)
+        if match[1] == 'above ':
+            low = nextafter(low, inf)
+        made(**{**given, key: low})
+        for beyond in (nextafter(low, -inf), *([nextafter(high, inf)] if match[3] else ())):
+            with pytest.raises(FourbarError, match=f'{section}.{key}'):
+                made(**{**given, key: beyond})
+        if match[3]:
+            made(**{**given, key: high})
+
+
+@pytest.mark.parametrize(('heading', 'kinds'), [
+    ('### Of a link sensor', SENSOR_FAULTS), ('### Of a flywheel drive', WHEEL_FAULTS)])
+def test_faults_are_told(heading: str, kinds: Mapping[str, FaultKind]) -> None:
+    """Every kind and no other, as the plant knows them."""
+    assert table_under(heading) == {
+        name: [kind.meaning, kind.quantity, kind.unit,
+               *(['', ''] if kind.default is None
+                 else [f'{kind.default:g}', f'{kind.low:g} to {kind.high:g}'])]
+        for name, kind in kinds.items()}
+
+
+def test_schedule_of_the_page_is_one(tmp_path: Path) -> None:
+    block = re.search(r'```yaml\n(faults:.*?)```', (ROOT / 'docs' / 'table.md').read_text(),
+                      re.DOTALL)
+    assert block is not None
+    path = tmp_path / 'faults.yaml'
+    path.write_text(block[1])
+    targets = (*LINK_NAMES, *FLYWHEEL_NAMES)
+    assert len(parse_schedule(read_schedule(str(path)), targets, str(path))) == 2
+
+
+def test_entries_of_the_accounts_are_told() -> None:
+    assert list(table_under('## The accounts')) == [item.name for item in fields(Ledger)]
+
+
+@pytest.mark.parametrize('heading', ['## Motors', '## Mechanisms'])
+def test_mechanisms_are_told(heading: str) -> None:
+    """Every value of the presets; their four links are alike."""
+    presets = [load_yaml(config_file('mechanism', name)) for name in ('paper', 'prototype')]
+    defaults = {item.name: item.default_factory()[0] for item in fields(Mechanism)
+                if item.default_factory is not MISSING}
+    told = table_under(heading)
+    for key, cells in told.items():
+        if key == 'motor_*':
+            continue
+        for preset, cell in zip(presets, cells[-3:-1] if heading == '## Motors' else cells[1:]):
+            values = preset.get(key, [defaults.get(key)] * 4)
+            assert values == [values[0]] * 4
+            expected = values[0] if isinstance(values[0], list) else [values[0]]
+            assert [number(part) for part in cell.split(',')] == expected, key
+    motors = {item.name for item in fields(Mechanism) if item.name.startswith('motor_')}
+    assert set(told) == (motors if heading == '## Motors' else {
+        item.name for item in fields(Mechanism)} - motors | {'motor_*'})

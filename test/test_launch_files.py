@@ -15,7 +15,10 @@
 """Launch files, as far as they can be checked where there may be no launch."""
 
 import ast
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+import sys
+from types import ModuleType, SimpleNamespace
 
 from fourbar_ros.nodes.tables import TABLES
 import pytest
@@ -106,3 +109,46 @@ def test_launch_takes_it(path):
     declared = {entity.name for entity in description.entities
                 if isinstance(entity, DeclareLaunchArgument)}
     assert declared == set(arguments(path))
+
+
+class Stub(ModuleType):
+    """A module in which every name calls for nothing more than to be remembered."""
+
+    def __getattr__(self, name):
+        if name.startswith('__'):
+            raise AttributeError(name)
+        return lambda *args, **given: SimpleNamespace(args=args, **given)
+
+
+def nodes_started(monkeypatch, path, given):
+    """Return the parameters of each node that a launch file starts, without launch."""
+    for name in ('launch', 'launch.actions', 'launch.event_handlers', 'launch.substitutions',
+                 'launch_ros', 'launch_ros.actions'):
+        monkeypatch.setitem(sys.modules, name, Stub(name))
+    monkeypatch.setattr(
+        sys.modules['launch.substitutions'], 'LaunchConfiguration', lambda name: SimpleNamespace(
+            perform=lambda context: given.get(name, context[name]['default_value'])),
+        raising=False)
+    spec = spec_from_file_location('launched', path)
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    _, handler = module._start(arguments(path))
+    return {node.executable: dict(pair for part in node.parameters for pair in part.items())
+            for node in handler.args[0].on_exit}
+
+
+@each_file
+@pytest.mark.parametrize(('clock', 'simulated'), [
+    ('realtime', False), ('fast', True), ('lockstep', True)])
+def test_one_argument_sets_the_time_of_all_nodes(monkeypatch, path, clock, simulated):
+    started = nodes_started(monkeypatch, path, {'clock': clock})
+    assert set(started) == {'plant', 'estimator', 'controller'}
+    assert {name: given['use_sim_time'] for name, given in started.items()} == dict.fromkeys(
+        started, simulated)
+    assert started['plant']['clock'] == clock
+
+
+@each_file
+def test_clock_that_is_not_given_is_left_to_the_parameters_file(monkeypatch, path):
+    for given in nodes_started(monkeypatch, path, {}).values():
+        assert given == {}

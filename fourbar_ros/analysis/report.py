@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from datetime import datetime
 from functools import partial
 import html as markup
@@ -27,11 +27,10 @@ from typing import Any
 from fourbar_ros.analysis.bags import BagError, read_bag, Recording
 from fourbar_ros.analysis.metrics import MEANINGS, metrics
 from fourbar_ros.analysis.motion import find_motion
+from fourbar_ros.analysis.progress import Progress
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import load_mechanism, Mechanism
 import numpy as np
-
-Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 class ReportError(FourbarError):

@@ -57,7 +57,8 @@ WIDTH_IN = 10.0
 # Two points a bin: about one bin for each pixel of a panel.
 BINS = 450
 
-_RC: dict[Any, Any] = {
+# The look of every figure, for `matplotlib.rc_context`.
+RC: dict[Any, Any] = {
     'font.size': 9.0,
     'axes.titlesize': 9.5,
     'axes.titlelocation': 'left',
@@ -100,7 +101,7 @@ def draw(make: Callable[[], Figure], salt: str) -> str:
 
     :param salt: makes the identifiers of this figure different from those of its neighbours.
     """
-    with rc_context({**_RC, 'svg.hashsalt': salt}):
+    with rc_context({**RC, 'svg.hashsalt': salt}):
         buffer = io.StringIO()
         make().savefig(buffer, format='svg', metadata={'Date': None, 'Creator': None})
     return _for_page(buffer.getvalue(), salt)

@@ -12,30 +12,30 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""`fourbar demo`: plant, estimator and controller as nodes, one move, a bag, a report."""
+"""`fourbar demo`: a scenario's nodes in processes of their own, one move, a bag, a report."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack
 import fcntl
 import gc
-from math import degrees, pi
+from math import degrees
 import os
 from pathlib import Path
 import shutil
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from fourbar_ros.commands.files import OutputError
+from fourbar_ros.commands.files import OutputError, write_whole
 from fourbar_ros.commands.processes import Processes
 from fourbar_ros.errors import FourbarError
+import yaml
+
+if TYPE_CHECKING:
+    from fourbar_ros.loop import Scenario
 
 NODES = ('plant', 'estimator', 'controller')
-
-# The paper's section 4: the whole turns by a quarter, by the soft step of the controller.
-TURN = pi / 2
-LINKS = ('link_a', 'link_b')
 
 STATUSES = ('device_status', 'controller_status')
 JOINTS = (
@@ -59,16 +59,21 @@ TABLE = (
     ('loop, lost ticks', 'loop.lost', 1.0, ''),
 )
 
+# No wheel breaks here, and a laptop that also shows films holds a node up for longer than a real
+# table should bear.
+PATIENCE = 1.0
+
 # Times [s]: to look for another plant, for everything to come up, to settle before and after.
-LOOK_AROUND = 0.3
+LOOK_AROUND = 0.5
 START_UP = 30.0
 SETTLE_BEFORE = 0.3
 SETTLE_AFTER = 1.1
 
 EPILOG = """\
 Uses the ROS_DOMAIN_ID of the environment (default 0) with discovery on this machine alone.
-Writes DIR/bag (rosbag2, MCAP), DIR/report.html, DIR/metrics.json and DIR/logs; what a former
-demo left there is replaced.
+Writes DIR/bag (rosbag2, MCAP), DIR/report.html, DIR/metrics.json, DIR/parameters.yaml (of the
+nodes) and DIR/logs; what a former demo left there is replaced. Arming and setpoint come from the
+scenario, in its order but not to the tick.
 """
 
 
@@ -81,6 +86,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     parser.add_argument('--output', metavar='DIR', type=Path, default=Path('demo_output'),
                         help='folder for bag, report and metrics (default demo_output)')
+    parser.add_argument('--preset', metavar='NAME', default='paper',
+                        help='scenario with one setpoint: paper (default), prototype or a file')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -92,17 +99,22 @@ def run(args: argparse.Namespace) -> int:
                           str(share_directory() / 'config' / 'fastdds_loopback.xml'))
     from fourbar_ros.nodes.environment import check_environment
     check_environment()
-    from fourbar_ros.loop.warm_up import main as compile_kernels
     from fourbar_ros.nodes.client import TestbedClient
 
     with TestbedClient() as testbed, ExitStack() as stack:
-        # Once here, or three nodes would do it side by side; meanwhile others are discovered.
+        # At once, because what comes next takes seconds where somebody else computes.
+        _refuse_second_plant(testbed)
+        scenario = _one_move(args.preset)
+        # Once here, or three nodes would do it side by side.
+        from fourbar_ros.loop.warm_up import main as compile_kernels
         compile_kernels()
         _refuse_second_plant(testbed)
         stack.enter_context(_locked(args.output))
         _prepare(args.output)
+        parameters = _write_parameters(scenario, args.output / 'parameters.yaml')
         with Processes(args.output / 'logs', os.environ) as processes:
-            _move(testbed, processes, args.output / 'bag', progress_bar)
+            _start(processes, args.output / 'bag', parameters)
+            _move(testbed, processes, scenario, progress_bar)
     print('Writing the report')
     metrics = write_report(args.output / 'bag', args.output / 'report.html',
                            args.output / 'metrics.json')
@@ -111,6 +123,16 @@ def run(args: argparse.Namespace) -> int:
     gc.freeze()
     print(f'Report   {args.output / "report.html"}')
     return 0
+
+
+def _one_move(preset: str) -> Scenario:
+    """Read the scenario."""
+    from fourbar_ros.loop import load_scenario
+    scenario = load_scenario(preset)
+    if len(scenario.setpoints) != 1:
+        raise DemoError(f'--preset {preset}: the demo makes one move, this scenario has '
+                        f'{len(scenario.setpoints)} setpoints')
+    return scenario
 
 
 def _analysis() -> tuple[Callable[..., dict[str, Any]], Any]:
@@ -154,7 +176,7 @@ def _prepare(output: Path) -> None:
         for name in ('bag', 'logs'):
             if (output / name).exists():
                 shutil.rmtree(output / name)
-        for name in ('report.html', 'metrics.json'):
+        for name in ('report.html', 'metrics.json', 'parameters.yaml'):
             (output / name).unlink(missing_ok=True)
         (output / 'logs').mkdir()
     except OSError as error:
@@ -162,18 +184,41 @@ def _prepare(output: Path) -> None:
             f'cannot write to {error.filename or output}: {error.strerror}') from None
 
 
-def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> None:
-    """Start everything, arm, move, and stop everything again."""
-    from fourbar_ros.nodes.runtime import step_back
+def _write_parameters(scenario: Scenario, path: Path) -> list[str]:
+    """
+    Write the parameters of the nodes.
+
+    :returns: the arguments with which a node takes them.
+    """
+    parameters = scenario.parameters()
+    parameters['plant']['command_timeout'] = PATIENCE
+    parameters['controller']['setpoint_duration'] = _duration(scenario)
+    with write_whole(path) as file:
+        yaml.safe_dump({f'/**/{node}': {'ros__parameters': values}
+                        for node, values in parameters.items()}, file, sort_keys=False)
+    return ['--ros-args', '--params-file', str(path.absolute())]
+
+
+def _duration(scenario: Scenario) -> float:
+    """Return the time in which the setpoint is reached [s]."""
+    return scenario.setpoints[0].duration or scenario.controller.setpoint_duration
+
+
+def _start(processes: Processes, bag: Path, parameters: Sequence[str]) -> None:
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     print(f'Starting {", ".join(NODES)}. Watch them from another terminal:\n'
           f'  ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST '
           'ros2 topic echo /estimate/link_states', flush=True)
     processes.start('record', ['-o', str(bag)])
     for name in NODES:
-        processes.start(name)
+        processes.start(name, parameters)
+
+
+def _move(testbed: Any, processes: Processes, scenario: Scenario, progress_bar: Any) -> None:
+    """Wait for everything, arm, move, and stop everything again."""
     # What the report needs, loaded while there is nothing to do but wait.
     import fourbar_ros.analysis.figures  # noqa: F401
+    from fourbar_ros.nodes.runtime import step_back
 
     def until(condition: Callable[[], bool], missing: str, seconds: float = START_UP) -> None:
         def checked() -> bool:
@@ -192,29 +237,31 @@ def _move(testbed: Any, processes: Processes, bag: Path, progress_bar: Any) -> N
     testbed.leave_joints(*(set(JOINTS) - set(WATCHED)))
     settled_ns = testbed.stamp_ns() + SETTLE_BEFORE * 1e9
     until(lambda: bool(testbed.stamp_ns() >= settled_ns), 'no ticks came')
-    _demand(*testbed.arm(True))
+    _demand(*testbed.switch('arm', True))
     until(lambda: testbed.statuses['device_status']['state'] == 'armed', 'no word of the arming')
     until(lambda: _armed(testbed) and testbed.statuses['controller_status']['mode'] == 'hold',
           'the controller did not notice the arming')
-    # As it stood when it was last looked at; nothing has moved it since.
-    goal = [angle + TURN for angle in testbed.positions('sim/link_states', LINKS)]
-    accepted, reason = testbed.setpoint(LINKS, goal)
+    setpoint = scenario.setpoints[0]
+    accepted, reason = testbed.setpoint(setpoint.names, setpoint.positions)
     _demand(accepted or not _armed(testbed), f'setpoint refused: {reason}')
 
     start_ns = testbed.stamp_ns()
-    duration = float(testbed.statuses['controller_status']['setpoint_duration_s']) + SETTLE_AFTER
-    print(f'Turning by {degrees(TURN):g} deg, {duration:.1f} s', flush=True)
+    duration = _duration(scenario) + SETTLE_AFTER
+    goal = ', '.join(f'{name} to {degrees(angle):g} deg'
+                     for name, angle in zip(setpoint.names, setpoint.positions))
+    print(f'Turning {goal}, {duration:.1f} s', flush=True)
     # disable=None: a bar only where stderr is a terminal.
     with progress_bar(total=duration, bar_format=PROGRESS, disable=None) as bar:
         def arrived() -> bool:
             _armed(testbed)
             elapsed = (testbed.stamp_ns() - start_ns) * 1e-9
-            angle = degrees(testbed.positions('estimate/link_states', LINKS)[0])
-            bar.set_postfix_str(f'link_a at {angle:.1f} deg', refresh=False)
+            link = setpoint.names[0]
+            angle = degrees(testbed.positions('estimate/link_states', [link])[0])
+            bar.set_postfix_str(f'{link} at {angle:.1f} deg', refresh=False)
             bar.update(min(elapsed, duration) - bar.n)
             return bool(elapsed >= duration)
         until(arrived, 'the motion did not end', 3.0 * duration)
-    testbed.arm(False)
+    testbed.switch('arm', False)
     processes.stop(*NODES)
     processes.stop('record')
 

@@ -46,11 +46,14 @@ COMMANDS = {
     'disarm': 'stop driving the wheels, they coast',
     'stop': 'emergency stop, latched',
     'reset': 'release the emergency stop',
+    'sim': 'pause, resume, step or reset the simulated table',
     'status': 'show device and controller',
     'record': 'write topics to a rosbag2 directory',
     'report': 'turn a bag into an HTML report and metrics',
     'demo': 'the whole loop, from start to report',
     'simulate': 'integrate one motion, without ROS',
+    'bench': 'time the mechanics beside MuJoCo',
+    'study': 'rerun a study of the paper',
 }
 
 # Commands that share a module; the others have one of their own name.

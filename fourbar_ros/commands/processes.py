@@ -26,6 +26,7 @@ import sys
 import time
 from types import TracebackType
 
+import fourbar_ros
 from fourbar_ros.errors import FourbarError
 
 # From <sys/prctl.h>: ask the kernel for a signal when the parent dies, however it dies.
@@ -55,6 +56,10 @@ class Processes:
     def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
         self._logs = logs
         self._environment = dict(environment)
+        if not Path(fourbar_ros.__file__).parents[1].samefile(Path.cwd()):
+            # Or they would run the checkout that somebody stands in, instead of this package,
+            # and compile its kernels, each for itself. (Python 3.10 does not know it.)
+            self._environment['PYTHONSAFEPATH'] = '1'
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
     def __enter__(self) -> Processes:

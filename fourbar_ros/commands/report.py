@@ -17,11 +17,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
 from pathlib import Path
 import sys
-from typing import Any
 
+from fourbar_ros.commands.progress import show_progress
 from fourbar_ros.errors import FourbarError
 
 
@@ -48,22 +47,17 @@ def run(args: argparse.Namespace) -> int:
         from fourbar_ros.analysis.report import write_report
         import matplotlib  # noqa: F401
         import rosbags  # noqa: F401
-        from tqdm import tqdm
+        import tqdm  # noqa: F401
     except ImportError as error:
         raise FourbarError(
             f'{error.name} is missing: pip install fourbar_ros[analysis]') from error
-
-    def progress(items: Iterable[Any], total: int) -> Iterable[Any]:
-        # disable=None: only where stderr is a terminal.
-        bar: Iterable[Any] = tqdm(items, total=total, disable=None, leave=False, file=sys.stderr)
-        return bar
 
     bag = Path(args.bag)
     beside = bag.absolute()
     html = Path(args.output or beside.with_name(f'{beside.name}.report.html'))
     metrics_json = Path(args.metrics or beside.with_name(f'{beside.name}.metrics.json'))
     result = write_report(bag, html, metrics_json, args.mechanism, namespace=args.namespace,
-                          progress=progress)
+                          progress=show_progress)
     for reason in dict.fromkeys(result['missing'].values()):
         names = [name for name, why in result['missing'].items() if why == reason]
         print(f'without {", ".join(names)}: {reason}', file=sys.stderr)

@@ -21,8 +21,8 @@ import argparse
 from fourbar_ros.commands.ros import add_ros_arguments, report_verdict, testbed_client
 
 CALLS = {
-    'arm': lambda testbed: testbed.arm(True),
-    'disarm': lambda testbed: testbed.arm(False),
+    'arm': lambda testbed: testbed.switch('arm', True),
+    'disarm': lambda testbed: testbed.switch('arm', False),
     'stop': lambda testbed: testbed.trigger('emergency_stop'),
     'reset': lambda testbed: testbed.trigger('reset_emergency_stop'),
 }

@@ -16,10 +16,12 @@
 
 from __future__ import annotations
 
-from fourbar_ros.mechanism.parameters import Array
+from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
 
+@kernel
 def minimum_norm(wheel_map: Array, flywheel_inertias: Array, demand: Array) -> Array:
     """
     Find the torques with the smallest norm of wheel accelerations (paper eq. 8, corrected).
@@ -31,6 +33,19 @@ def minimum_norm(wheel_map: Array, flywheel_inertias: Array, demand: Array) -> A
     :param demand: A du + b (2,) [N m].
     :returns: (4,) torques on the wheels [N m].
     """
-    weighted = wheel_map * flywheel_inertias ** 2
-    torques: Array = -weighted.T @ np.linalg.solve(weighted @ wheel_map.T, demand)
+    n00 = n01 = n11 = 0.0
+    for wheel in range(flywheel_inertias.size):
+        first, second = wheel_map[0, wheel], wheel_map[1, wheel]
+        weight = flywheel_inertias[wheel] ** 2
+        n00 += weight * first * first
+        n01 += weight * first * second
+        n11 += weight * second * second
+    # The identity in G keeps this matrix of two by two far from singular.
+    inverse = 1.0 / (n00 * n11 - n01 * n01)
+    first_share = (n11 * demand[0] - n01 * demand[1]) * inverse
+    second_share = (n00 * demand[1] - n01 * demand[0]) * inverse
+    torques = np.empty(flywheel_inertias.size)
+    for wheel in range(flywheel_inertias.size):
+        torques[wheel] = -flywheel_inertias[wheel] ** 2 * (
+            wheel_map[0, wheel] * first_share + wheel_map[1, wheel] * second_share)
     return torques

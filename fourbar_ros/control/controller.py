@@ -20,12 +20,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import pi, sin
 
-from fourbar_ros.control.allocation import minimum_norm
 from fourbar_ros.control.reference import SoftStep
 from fourbar_ros.control.setpoint import check_names, plan, SetpointError
+from fourbar_ros.control.tracking import computed_torques
 from fourbar_ros.mechanism import Mechanism, nearest_assembly
-from fourbar_ros.mechanism.dynamics import gamma_matrix, reduced_form
-from fourbar_ros.mechanism.parameters import Array
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.dynamics import gamma_matrix
 import numpy as np
 
 # A setpoint with a stamp (not zero, which means now) may be this far from the last tick [s].
@@ -102,6 +102,8 @@ class Controller:
         self.last_refusal = ''
         self.saturated = 0
         self._mechanism = mechanism
+        self._constants = np.array([mechanism.constants])
+        self._limits: list[float] = mechanism.motor_torque_limits.tolist()
         self._armed = False
         self._move: SoftStep | None = None
         self._move_start_ns = 0
@@ -112,8 +114,9 @@ class Controller:
         self._work = 0.0
         # Compile the kernels now, not while time runs.
         square = np.array([0.0, pi / 2.0, 0.0, pi / 2.0])
-        reduced_form(mechanism, square, np.zeros(2))
-        gamma_matrix(square, mechanism.constants.lengths)
+        SoftStep(np.zeros((3, 2)), np.zeros(2), 1.0).at(0.5)
+        computed_torques(square, np.zeros(4), np.zeros(2), self._constants)
+        gamma_matrix(square, mechanism.link_lengths)
 
     def device_armed(self, armed: bool) -> None:
         """Follow the device's arming state."""
@@ -200,7 +203,7 @@ class Controller:
         if not rates.any():
             return np.zeros(4)
         # A planned move keeps its distance from change points, so Gamma exists here.
-        gamma = gamma_matrix(self._reference_angles, self._mechanism.constants.lengths)
+        gamma = gamma_matrix(self._reference_angles, self._mechanism.link_lengths)
         return np.concatenate([rates, gamma @ rates])
 
     def _torques(self, link_angles: Array, link_rates: Array, angle_errors: Array,
@@ -212,11 +215,8 @@ class Controller:
         damping = 2.0 * self.settings.damping * self.settings.bandwidth
         acceleration = (self._reference[2] + damping * rate_errors[:2]
                         + stiffness * angle_errors[:2])
-        form = reduced_form(self._mechanism, link_angles, link_rates)
-        torques = minimum_norm(
-            form.wheel_map, self._mechanism.flywheel_inertias,
-            form.mass_matrix @ acceleration + form.bias)
-        excess = float(np.max(np.abs(torques) / self._mechanism.motor_torque_limits))
+        torques = computed_torques(link_angles, link_rates, acceleration, self._constants)
+        excess = max(abs(torque) / limit for torque, limit in zip(torques.tolist(), self._limits))
         if excess > 1.0:
             # Scaled together, so that the direction of the motion stays.
             self.saturated += 1
@@ -227,10 +227,12 @@ class Controller:
                  ) -> float:
         inertias = self._mechanism.flywheel_inertias
         absolute = wheel_speeds + link_rates
+        # Twice the energy, and what eq. 9 adds up.
+        doubled = float(inertias @ (absolute * absolute))
         if self._stamp_ns is not None:
             period = (stamp_ns - self._stamp_ns) * 1e-9
             if 0.0 < period <= LONGEST_PERIOD:
-                self._eq9 += float(inertias @ (absolute * absolute)) * period
+                self._eq9 += doubled * period
                 self._work += float(np.abs(efforts * wheel_speeds).sum()) * period
         self._stamp_ns = stamp_ns
-        return 0.5 * float(inertias @ (absolute * absolute))
+        return 0.5 * doubled

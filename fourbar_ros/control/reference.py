@@ -17,9 +17,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
-from fourbar_ros.mechanism.parameters import Array
+from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.mechanism.constants import Array
 import numpy as np
+
+
+@kernel
+def evaluate(coefficients: Array, time: float, duration: float) -> Array:
+    """
+    Evaluate polynomials in time / duration, and their derivatives after the time.
+
+    :param coefficients: (6, axes).
+    :returns: (3, axes).
+    """
+    s = time / duration
+    values = np.zeros((3, coefficients.shape[1]))
+    # Horner's rule, which also gives half the second derivative.
+    for power in range(5, -1, -1):
+        values[2] = values[2] * s + values[1]
+        values[1] = values[1] * s + values[0]
+        values[0] = values[0] * s + coefficients[power]
+    values[1] /= duration
+    values[2] *= 2.0 / (duration * duration)
+    return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,22 +69,15 @@ class SoftStep:
         """
         if time >= self.duration:
             return np.array([self.goal, np.zeros(2), np.zeros(2)])
-        s = max(time, 0.0) / self.duration
-        powers = np.array([
-            [1.0, s, s ** 2, s ** 3, s ** 4, s ** 5],
-            [0.0, 1.0, 2.0 * s, 3.0 * s ** 2, 4.0 * s ** 3, 5.0 * s ** 4],
-            [0.0, 0.0, 2.0, 6.0 * s, 12.0 * s ** 2, 20.0 * s ** 3],
-        ])
-        scaling = np.array([1.0, 1.0 / self.duration, 1.0 / self.duration ** 2])
-        values: Array = scaling[:, None] * (powers @ self._coefficients())
-        return values
+        return evaluate(self._coefficients, max(time, 0.0), self.duration)
 
     def path(self, count: int) -> Array:
         """Sample the angles evenly in time, both ends included: (count, 2) [rad]."""
         powers = np.linspace(0.0, 1.0, count)[:, None] ** np.arange(6)
-        angles: Array = powers @ self._coefficients()
+        angles: Array = powers @ self._coefficients
         return angles
 
+    @cached_property
     def _coefficients(self) -> Array:
         """Return the polynomial's coefficients in time / duration: (6, 2)."""
         angle = self.start[0]

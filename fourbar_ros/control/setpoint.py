@@ -25,7 +25,7 @@ from fourbar_ros.mechanism import ClosureError, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.angles import wrap
 from fourbar_ros.mechanism.by_name import RejectedError, values_by_name
 from fourbar_ros.mechanism.closure import assemble_along, assemblies
-from fourbar_ros.mechanism.parameters import Array
+from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
 # Closest approach to a change point that a move may plan, as |sin(phi_d - phi_c)|: there the

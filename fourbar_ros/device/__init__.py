@@ -14,15 +14,25 @@
 
 """What a testbed is, simulated or real: samples in, torques out, and when it may be driven."""
 
-from fourbar_ros.device.command import torques_by_name
+from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.device.gate import ArmingGate, DeviceState
-from fourbar_ros.device.pacing import RealtimePace
-from fourbar_ros.device.protocol import Device, LinkSample, Samples, WheelSample
+from fourbar_ros.device.pacing import (
+    Attendance,
+    ClockLimit,
+    FastPace,
+    LockstepGuard,
+    LockstepPace,
+    Pace,
+    PaceError,
+    RealtimePace,
+    Remedy,
+)
+from fourbar_ros.device.protocol import Device, Drive, Samples, WheelSample
 from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.device.testbed import Testbed, TestbedSettings, Timing
 
 __all__ = [
-    'ArmingGate', 'Device', 'DeviceState', 'LinkSample', 'RealtimePace',
-    'Samples', 'SimulatedTable', 'Testbed', 'TestbedSettings', 'Timing', 'torques_by_name',
-    'WheelSample',
+    'ArmingGate', 'Attendance', 'ClockLimit', 'Device', 'DeviceState', 'Drive', 'drive_by_name',
+    'FastPace', 'LockstepGuard', 'LockstepPace', 'Pace', 'PaceError', 'RealtimePace', 'Remedy',
+    'Samples', 'SimulatedTable', 'Testbed', 'TestbedSettings', 'Timing', 'WheelSample',
 ]

@@ -18,26 +18,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from fourbar_ros.device.protocol import Drive, no_torque
 from fourbar_ros.mechanism import FLYWHEEL_NAMES
 from fourbar_ros.mechanism.by_name import RejectedError, values_by_name
-from fourbar_ros.mechanism.parameters import Array
-import numpy as np
 
 
-def torques_by_name(names: Sequence[str], positions: Sequence[float],
-                    velocities: Sequence[float], efforts: Sequence[float]) -> Array:
+def drive_by_name(names: Sequence[str], positions: Sequence[float],
+                    velocities: Sequence[float], efforts: Sequence[float]) -> Drive:
     """
-    Turn a command by wheel names into torques.
+    Turn a command by wheel names into a drive.
 
     :param names: wheels in any order; one that is not named gets no torque.
-    :param positions, velocities: must be empty, wheels are commanded by effort.
-    :param efforts: torque for each name [N m].
-    :returns: (4,) torques in the order a, b, c, d [N m].
+    :param positions: must be empty.
+    :param velocities: speed relative to the link for each name [rad/s], or
+    :param efforts: torque for each name [N m]: one of both, the other must be empty.
     :raises RejectedError: anything else; kinds `fields`, `names`, `length`, `finite`.
     """
-    if len(positions) or len(velocities):
-        raise RejectedError('fields', 'position and velocity must be empty, only effort is taken')
-    torques = np.zeros(4)
-    for wheel, effort in values_by_name(names, efforts, FLYWHEEL_NAMES, 'effort').items():
-        torques[wheel] = effort
-    return torques
+    if len(positions) or (len(velocities) and len(efforts)):
+        raise RejectedError(
+            'fields', 'position must be empty, and so must be one of velocity and effort')
+    drive = no_torque()
+    given, field = (velocities, 'velocity') if len(velocities) else (efforts, 'effort')
+    for wheel, value in values_by_name(names, given, FLYWHEEL_NAMES, field).items():
+        drive.values[wheel] = value
+        drive.by_speed[wheel] = field == 'velocity'
+    return drive

@@ -20,23 +20,28 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from fourbar_ros.mechanism import Mechanism
-from fourbar_ros.mechanism.parameters import Array
-from fourbar_ros.plant import Truth
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.plant import SensorReading, Truth
+import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)
-class LinkSample:
+class Drive:
     """
-    Link orientations measured at one instant.
+    What the motors are asked for until the next tick.
 
-    :param stamp_ns: time of measurement [ns].
-    :param links: indices of the links that gave a sample (0 for link a), increasing.
-    :param angles: (n,) orientation of each in frame `table`, in (-pi, pi] [rad].
+    :param values: (4,) torque [N m], or speed of the wheel relative to its link [rad/s].
+    :param by_speed: (4,) bool, which of both; speeds are followed by the motors' own electronics.
     """
 
-    stamp_ns: int
-    links: tuple[int, ...]
-    angles: Array
+    values: Array
+    by_speed: NDArray[np.bool_]
+
+
+def no_torque() -> Drive:
+    """Let all wheels coast."""
+    return Drive(np.zeros(4), np.zeros(4, dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +64,7 @@ class Samples:
     """Everything that a testbed has to say at a tick; `truth` only where it is simulated."""
 
     stamp_ns: int
-    links: tuple[LinkSample, ...]
+    links: tuple[SensorReading, ...]
     wheels: WheelSample
     truth: Truth | None = None
 
@@ -71,17 +76,24 @@ class Device(Protocol):
     :cvar description: what it is, for people.
     :cvar mechanism: the linkage, its wheels and motor limits.
     :cvar period_ns: time between two ticks [ns].
+    :cvar sensor_names: the sensors of the links, `link_a` and so on.
+    :cvar measures_rates: whether they have gyros.
     """
 
     description: str
     mechanism: Mechanism
     period_ns: int
+    sensor_names: tuple[str, ...]
+    measures_rates: bool
 
-    def step(self, stamp_ns: int, torques: Array) -> Samples:
+    def step(self, stamp_ns: int, drive: Drive) -> Samples:
         """
-        Apply torques up to a tick, and report what was measured since the last one.
+        Drive the wheels up to a tick, and report what was measured since the last one.
 
         :param stamp_ns: the tick; the first call only sets the time [ns].
-        :param torques: (4,) within the motor limits [N m].
+        :param drive: within the motor limits.
         :raises FourbarError: the device failed and must not be driven.
         """
+
+    def diagnosis(self) -> dict[str, str]:
+        """Tell what is not as it should be, by what it is about; nothing if all is well."""

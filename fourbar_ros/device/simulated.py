@@ -16,11 +16,19 @@
 
 from __future__ import annotations
 
-from fourbar_ros.device.protocol import LinkSample, Samples, WheelSample
-from fourbar_ros.mechanism.parameters import Array
-from fourbar_ros.plant import Plant
+from collections import deque
+from typing import Any
 
-ALL_LINKS = (0, 1, 2, 3)
+from fourbar_ros.device.protocol import Drive, no_torque, Samples, WheelSample
+from fourbar_ros.mechanism import FLYWHEEL_NAMES
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.plant import Fault, InitialState, Plant
+from fourbar_ros.plant.faults import WHEEL_FAULTS, wheel_faults
+from fourbar_ros.plant.ledger import Ledger
+from fourbar_ros.plant.motion import conditions_of, SOUND
+from fourbar_ros.plant.schedule import FaultBoard, FaultChange
+import numpy as np
+from numpy.typing import NDArray
 
 
 class SimulatedTable:
@@ -29,6 +37,7 @@ class SimulatedTable:
 
     :param plant: what is simulated.
     :param period_ns: time between two ticks [ns].
+    :ivar faults: what is broken; change it by `break_down` and `schedule_faults`.
     :raises PlantError: the period is not a whole multiple of the plant step.
     """
 
@@ -37,24 +46,150 @@ class SimulatedTable:
     def __init__(self, plant: Plant, period_ns: int) -> None:
         self.mechanism = plant.mechanism
         self.period_ns = period_ns
+        self.sensor_names = plant.link_sensors.names
+        self.measures_rates = plant.link_sensors.settings.gyro
+        self.faults = FaultBoard((*self.sensor_names, *FLYWHEEL_NAMES))
         self._plant = plant
         self._steps_per_period = plant.steps_in(period_ns * 1e-9)
-        self._stamp_ns: int | None = None
-        self._wheel_angles = plant.sense_wheels() - plant.truth().wheel_speeds * period_ns * 1e-9
+        self._step_ns = period_ns // self._steps_per_period
+        self._first_ns: int | None = None
+        self._stamp_ns = 0
+        self._conditions = SOUND
+        # What was asked for, newest first, with the step at which that began.
+        self._asked: deque[tuple[int, Drive]] = deque([(-1, no_torque())])
+        self._delays: NDArray[np.int64] | None = None
+        self._longest_delay = round(WHEEL_FAULTS['delayed'].high * 1e9) // self._step_ns
+        self._steps = 0
+        self._wheel_angles = self._wheel_angles_before()
 
-    def step(self, stamp_ns: int, torques: Array) -> Samples:
-        """Move the plant to the tick under constant torques, and sample all sensors there."""
-        periods = 1
-        if self._stamp_ns is not None:
+    def reset(self, initial: InitialState) -> None:
+        """
+        Put the linkage somewhere; time and faults go on.
+
+        :raises PlantError, ClosureError: it cannot be there; then nothing was changed.
+        """
+        self._plant.reset(initial)
+        self._wheel_angles = self._wheel_angles_before()
+
+    def break_down(self, target: str, fault: Fault | None) -> None:
+        """
+        Break a sensor or a wheel from now on, or mend it with None.
+
+        :raises FaultError: there is no such sensor or wheel.
+        """
+        self.faults.set_fault(target, fault)
+        self._apply_faults()
+
+    def schedule_faults(self, entries: Any, origin: str) -> None:
+        """
+        Let faults come and go by a schedule, in seconds since the first tick.
+
+        :param entries: see plant.schedule.
+        :param origin: where they come from, for messages.
+        :raises FaultError: the schedule is refused; then nothing was changed.
+        """
+        self.faults.load(entries, origin, self._elapsed_ns)
+        self._apply_faults()
+
+    def step(self, stamp_ns: int, drive: Drive) -> Samples:
+        """Move the plant to the tick under a constant drive, and sample all sensors there."""
+        if self._first_ns is None:
+            self._first_ns = self._stamp_ns = stamp_ns
+            self._follow_schedule()
+            periods, efforts = 1, np.zeros(4)
+        else:
             periods = max(1, round((stamp_ns - self._stamp_ns) / self.period_ns))
-            self._plant.advance(periods * self._steps_per_period, torques)
-        self._stamp_ns = stamp_ns
-        truth = self._plant.truth()
+            efforts = self._move(periods * self._steps_per_period, drive)
+            self._stamp_ns = stamp_ns
+            self._follow_schedule()
+        self._plant.measure_links(stamp_ns)
         wheel_angles = self._plant.sense_wheels()
         speeds = (wheel_angles - self._wheel_angles) / (periods * self.period_ns * 1e-9)
         self._wheel_angles = wheel_angles
         return Samples(
-            stamp_ns,
-            (LinkSample(stamp_ns, ALL_LINKS, self._plant.sense_links()),),
-            WheelSample(wheel_angles, speeds, truth.efforts),
-            truth)
+            stamp_ns, self._plant.link_sensors.due(stamp_ns),
+            WheelSample(wheel_angles, speeds, efforts),
+            self._plant.truth(efforts))
+
+    def diagnosis(self) -> dict[str, str]:
+        """Tell what is broken, and whether the linkage has met the edge of the table."""
+        told = {}
+        if self.faults.faults:
+            told['faults'] = ', '.join(
+                f'{target} {fault}' for target, fault in self.faults.faults.items())
+        if contacts := self._plant.contacts:
+            told['edge'] = f'the linkage has met the edge of the table, {contacts} contacts'
+        return told
+
+    def ledger(self) -> Ledger:
+        """Draw up the accounts of energy and momentum since the start or the last reset."""
+        return self._plant.ledger()
+
+    @property
+    def _elapsed_ns(self) -> int:
+        return 0 if self._first_ns is None else self._stamp_ns - self._first_ns
+
+    def _move(self, steps: int, drive: Drive) -> Array:
+        """Advance, sampling the sensors whenever they are due; return the mean efforts."""
+        values, by_speed = self._commands(steps, drive)
+        self._plant.disturb(steps * self._step_ns * 1e-9)
+        efforts, done = np.zeros(4), 0
+        while done < steps:
+            until = self._next_pause(done, steps)
+            part = values if values.ndim == 1 else values[done:until]
+            self._plant.advance(until - done, part, by_speed, self._conditions)
+            efforts += self._plant.efforts * ((until - done) / steps)
+            done = until
+            if done < steps:
+                self._plant.measure_links(self._stamp_ns + done * self._step_ns)
+        self._steps += steps
+        return efforts
+
+    def _next_pause(self, done: int, steps: int) -> int:
+        """Return the step after which the next sample is due, or the last one."""
+        due_ns = self._plant.link_sensors.next_sample_ns
+        if due_ns is None or not self._plant.link_sensors.settings.rate:
+            return steps
+        return min(steps, max(done + 1, -((self._stamp_ns - due_ns) // self._step_ns)))
+
+    def _commands(self, steps: int, drive: Drive) -> tuple[Array, Any]:
+        """Return what the motors act on: the drive, or what was asked for some time ago."""
+        self._asked.appendleft((self._steps, drive))
+        while len(self._asked) > 1 and self._asked[-2][0] <= self._steps - self._longest_delay:
+            self._asked.pop()
+        delays = self._delays
+        if delays is None:
+            return drive.values, drive.by_speed
+        values, by_speed = np.tile(drive.values, (steps, 1)), drive.by_speed.copy()
+        for wheel in np.flatnonzero(delays):
+            past = [self._asked_at(self._steps + step - delays[wheel]) for step in range(steps)]
+            values[:, wheel] = [asked.values[wheel] for asked in past]
+            # From torque to speed, or back, within a period: at its begin.
+            by_speed[wheel] = past[0].by_speed[wheel]
+            values[[asked.by_speed[wheel] != by_speed[wheel] for asked in past], wheel] = (
+                past[0].values[wheel])
+        return values, by_speed
+
+    def _asked_at(self, step: int) -> Drive:
+        """Return what was asked for at a step."""
+        return next((drive for since, drive in self._asked if since <= step),
+                    self._asked[-1][1])
+
+    def _follow_schedule(self) -> tuple[FaultChange, ...]:
+        changes = self.faults.at_time(self._elapsed_ns)
+        if changes:
+            self._apply_faults()
+        return changes
+
+    def _apply_faults(self) -> None:
+        present = self.faults.faults
+        self._plant.link_sensors.set_faults(present)
+        broken = wheel_faults(present.values())
+        self._conditions = conditions_of(broken)
+        delays = np.round(broken.command_delay_s * 1e9 / self._step_ns).astype(int)
+        self._delays = delays if delays.any() else None
+
+    def _wheel_angles_before(self) -> Array:
+        """Return what the encoders showed a period ago, had the wheels turned steadily [rad]."""
+        return (self._plant.sense_wheels()
+                - self._plant.truth().wheel_speeds * (self.period_ns * 1e-9))

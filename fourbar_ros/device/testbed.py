@@ -25,19 +25,15 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from fourbar_ros.device.command import torques_by_name
+from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.device.gate import ArmingGate
-from fourbar_ros.device.protocol import Device, Samples
+from fourbar_ros.device.protocol import Device, Drive, no_torque, Samples
 from fourbar_ros.errors import FourbarError
-from fourbar_ros.mechanism import LINK_NAMES
 from fourbar_ros.mechanism.by_name import RejectedError
-from fourbar_ros.mechanism.parameters import Array
+from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
 TIMEOUT_ACTIONS = ('coast', 'hold_speed', 'brake')
-
-# Bandwidth of the wheel-speed loop behind `hold_speed` and `brake` [rad/s].
-PARKING_BANDWIDTH = 30.0
 
 
 # Ticks after which an answer is no longer waited for.
@@ -85,7 +81,7 @@ class Testbed:
 
     :ivar gate: whether the wheels may be driven.
     :ivar rejected: number of rejected commands by kind.
-    :ivar clipped: number of commands that asked more torque than a motor has.
+    :ivar clipped: number of commands that asked more than a motor has.
     :ivar last_rejection: what was wrong with the last rejected command, or ''.
     """
 
@@ -98,10 +94,10 @@ class Testbed:
         self.clipped = 0
         self.last_rejection = ''
         self._settings = settings
-        self._torques = np.zeros(4)
-        self._parked_speeds: Array | None = None
+        self._drive = no_torque()
+        self._parked: Drive | None = None
         self._wheel_speeds = np.zeros(4)
-        self._link_seen_ns: list[int | None] = [None] * 4
+        self._seen_ns: dict[str, int] = {}
         self._tick_ns: int | None = None
         # Ticks without an answer so far: when each went out, by stamp. Those that have waited for
         # more than a period are counted as lost, but their round trip is still told if it ends.
@@ -123,16 +119,16 @@ class Testbed:
         timing = self._timing(steady_ns)
         self._watch_commands(stamp_ns, steady_ns)
         try:
-            samples = self.device.step(stamp_ns, self._driving_torques())
+            samples = self.device.step(stamp_ns, self._present_drive())
         except FourbarError as error:
-            self._parked_speeds = None
+            self._parked = None
             self.gate.fail(stamp_ns, str(error))
             raise
         self._tick_ns = stamp_ns
         self._wheel_speeds = samples.wheels.speeds
         for sample in samples.links:
-            for link in sample.links:
-                self._link_seen_ns[link] = sample.stamp_ns
+            for name in sample.names:
+                self._seen_ns[name] = max(sample.stamp_ns, self._seen_ns.get(name, 0))
         return samples, timing
 
     def published(self, steady_ns: int, step_ns: int) -> None:
@@ -155,14 +151,16 @@ class Testbed:
         """
         try:
             self._check_stamp(stamp_ns)
-            torques = torques_by_name(names, positions, velocities, efforts)
+            drive = drive_by_name(names, positions, velocities, efforts)
         except RejectedError as error:
             self.rejected[error.kind] += 1
             self.last_rejection = str(error)
             raise
-        limits = self.device.mechanism.motor_torque_limits
-        limited = np.clip(torques, -limits, limits)
-        self.clipped += bool((limited != torques).any())
+        mechanism = self.device.mechanism
+        limits = np.where(
+            drive.by_speed, mechanism.motor_speed_limits, mechanism.motor_torque_limits)
+        limited = np.clip(drive.values, -limits, limits)
+        self.clipped += bool((limited != drive.values).any())
         if self._command_stamp_ns is None:
             # Nobody was there yet to answer the ticks before this one.
             self._open_ticks = {tick: published_ns for tick, published_ns
@@ -170,7 +168,7 @@ class Testbed:
         self._command_stamp_ns = stamp_ns
         self._command_steady_ns = steady_ns
         self._answered(stamp_ns, steady_ns)
-        self._torques[:] = limited
+        self._drive = Drive(limited, drive.by_speed)
 
     def arm(self, steady_ns: int, obstacles: Sequence[str]) -> tuple[bool, str]:
         """
@@ -179,9 +177,9 @@ class Testbed:
         :param obstacles: what speaks against it beyond what is known here.
         :returns: whether it is armed now, and why (not).
         """
-        silent = [name for name, seen_ns in zip(LINK_NAMES, self._link_seen_ns)
-                  if seen_ns is None
-                  or self._now_ns - seen_ns > self._settings.sensor_timeout_s * 1e9]
+        silent = [name for name in self.device.sensor_names
+                  if name not in self._seen_ns
+                  or self._now_ns - self._seen_ns[name] > self._settings.sensor_timeout_s * 1e9]
         if silent:
             obstacles = [*obstacles, f'no sample from {", ".join(silent)} for '
                                      f'{self._settings.sensor_timeout_s:g} s']
@@ -189,18 +187,18 @@ class Testbed:
         armed, message = self.gate.arm(self._now_ns, obstacles)
         if armed and not was_armed:
             self._armed_steady_ns = steady_ns
-            self._parked_speeds = None
-            self._torques[:] = 0.0
+            self._parked = None
+            self._drive = no_torque()
         return armed, message
 
     def disarm(self, reason: str) -> None:
         """Stop driving: the wheels coast."""
-        self._parked_speeds = None
+        self._parked = None
         self.gate.disarm(self._now_ns, reason)
 
     def emergency_stop(self, reason: str) -> None:
         """Stop driving until reset: the wheels coast."""
-        self._parked_speeds = None
+        self._parked = None
         self.gate.emergency_stop(self._now_ns, reason)
 
     def reset(self) -> tuple[bool, str]:
@@ -214,7 +212,8 @@ class Testbed:
             'ticks_lost': self._lost, 'commands_clipped': self.clipped,
             'last_rejection': self.last_rejection,
             **{f'commands_rejected_{kind}': count
-               for kind, count in sorted(self.rejected.items())}}
+               for kind, count in sorted(self.rejected.items())},
+            **self.device.diagnosis()}
 
     @property
     def _now_ns(self) -> int:
@@ -264,18 +263,15 @@ class Testbed:
             self.gate.disarm(
                 stamp_ns, f'no flywheel_command for {self._settings.command_timeout_s:g} s')
             if self._settings.timeout_action == 'hold_speed':
-                self._parked_speeds = self._wheel_speeds.copy()
+                self._parked = _at_speeds(self._wheel_speeds)
             elif self._settings.timeout_action == 'brake':
-                self._parked_speeds = np.zeros(4)
+                self._parked = _at_speeds(np.zeros(4))
 
-    def _driving_torques(self) -> Array:
+    def _present_drive(self) -> Drive:
         if self.gate.armed:
-            return self._torques
-        if self._parked_speeds is None:
-            return np.zeros(4)
-        mechanism = self.device.mechanism
-        gain = PARKING_BANDWIDTH * mechanism.flywheel_inertias
-        limits = mechanism.motor_torque_limits
-        torques: Array = np.clip(
-            gain * (self._parked_speeds - self._wheel_speeds), -limits, limits)
-        return torques
+            return self._drive
+        return self._parked or no_torque()
+
+
+def _at_speeds(speeds: Array) -> Drive:
+    return Drive(speeds.copy(), np.ones(4, dtype=bool))

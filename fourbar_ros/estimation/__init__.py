@@ -14,6 +14,12 @@
 
 """What we believe: the Kalman filter on link angles and wheel motion."""
 
-from fourbar_ros.estimation.estimator import Estimate, Estimator, EstimatorSettings, Innovation
+from fourbar_ros.estimation.estimator import (
+    Estimate,
+    Estimator,
+    EstimatorSettings,
+    Innovation,
+    STATE_NAMES,
+)
 
-__all__ = ['Estimate', 'Estimator', 'EstimatorSettings', 'Innovation']
+__all__ = ['Estimate', 'Estimator', 'EstimatorSettings', 'Innovation', 'STATE_NAMES']

@@ -26,25 +26,32 @@ good Gamma is kept, which is exact for a parallelogram.
 
 from __future__ import annotations
 
-from math import pi, sin
+from math import inf, pi, sin, sqrt
 
 from filterpy.kalman import ExtendedKalmanFilter
-from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism import JOINT_LINKS, Mechanism
 from fourbar_ros.mechanism.compiled import kernel
-from fourbar_ros.mechanism.dynamics import (
-    gamma_matrix,
-    mass_matrix,
-    project_onto_closure,
-)
-from fourbar_ros.mechanism.motion import advance_state, STATE_SIZE
-from fourbar_ros.mechanism.parameters import Array, Constants
+from fourbar_ros.mechanism.constants import Array, Constants
+from fourbar_ros.mechanism.dynamics import gamma_matrix, mass_matrix
+from fourbar_ros.mechanism.forces import NOTHING
+from fourbar_ros.mechanism.layout import STATE_SIZE
+from fourbar_ros.mechanism.motion import advance_state, meet_closure
 import numpy as np
+from numpy.typing import NDArray
 
 # Below this |sin(phi_d - phi_c)| the last good Gamma is kept: it divides by that sine.
 GAMMA_IS_LOST = 0.05
 
 # Half width of the central differences for the transition matrix [rad], [rad/s].
 DIFFERENCE = 1e-6
+
+
+# What each of SENSOR_NAMES makes of the four link angles.
+SENSOR_ROWS = np.vstack([np.eye(4), np.zeros((4, 4))])
+for _row, (_first, _second) in enumerate(JOINT_LINKS, 4):
+    SENSOR_ROWS[_row, [_first, _second]] = -1.0, 1.0
+
+Snapshot = tuple[Array, Array, Array, Array]
 
 
 class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
@@ -65,14 +72,15 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
     def __init__(self, mechanism: Mechanism, angles: Array, angle_variance: float,
                  rate_variance: float, disturbance: float) -> None:
         super().__init__(dim_x=4, dim_z=4)
-        self._constants = mechanism.constants_with_locked_wheels
+        # An array of one: a record by itself takes longer to hand to a kernel than it runs.
+        self._constants = np.array(
+            [mechanism.with_rigid_joints().constants_with(np.ones(4, dtype=bool))])
         self._disturbance = disturbance
-        self._scratch = np.empty((6, STATE_SIZE))
         self._state = np.zeros(STATE_SIZE)
         self.angles = np.array(angles)
         self._to_links = np.vstack([np.eye(2), np.eye(2)])
         if abs(sin(angles[3] - angles[2])) > GAMMA_IS_LOST:
-            self._to_links[2:] = gamma_matrix(self.angles, self._constants.lengths)
+            self._to_links[2:] = gamma_matrix(self.angles, mechanism.link_lengths)
         self.x = np.array([angles[0], angles[1], 0.0, 0.0])
         self.P = np.diag([angle_variance, angle_variance, rate_variance, rate_variance])
 
@@ -89,10 +97,15 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
 
     def sigmas(self) -> tuple[Array, Array]:
         """Return one standard deviation of the four angles [rad] and rates [rad/s]: two (4,)."""
-        to_links = self._to_links
-        angles = ((to_links @ self.P[:2, :2]) * to_links).sum(axis=1)
-        rates = ((to_links @ self.P[2:, 2:]) * to_links).sum(axis=1)
-        return np.sqrt(angles), np.sqrt(rates)
+        return link_sigmas(self.P, self._to_links)
+
+    def snapshot(self) -> Snapshot:
+        """Return a copy of what move and correct change, for :meth:`restore`."""
+        return self.x.copy(), self.P.copy(), self.angles.copy(), self._to_links.copy()
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go back to a snapshot."""
+        self.x, self.P, self.angles, self._to_links = (array.copy() for array in snapshot)
 
     def move(self, duration: float, wheel_torques: Array) -> None:
         """
@@ -102,79 +115,117 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         :param wheel_torques: (4,) If dOmega/dt, the wheels' measured relative motion [N m].
         """
         predict(self.x, self.P, self.angles, self._to_links, wheel_torques, duration,
-                self._disturbance, self._constants, self._scratch, self._state, self.F, self.Q)
-        self.x_prior, self.P_prior = self.x.copy(), self.P.copy()
+                self._disturbance, self._constants, self._state, self.F, self.Q)
 
-    def correct(self, links: tuple[int, ...], measured: Array, variance: float) -> tuple[
-            Array, float]:
+    def correct(self, sensors: tuple[int, ...], measured: Array, variance: float,
+                gate: float = inf) -> tuple[Array, float, NDArray[np.bool_]]:
         """
-        Update with measured link angles.
+        Update with measured angles of links and joints, those left out that are far off.
 
-        :param links: indices of the links that were measured (0 for link a).
+        S, its inverse and K are those of the sensors that were used; y has all.
+
+        :param sensors: which were measured, as indices of `SENSOR_NAMES`.
         :param measured: (n,) their angles, any turn [rad].
         :param variance: of each [rad^2].
-        :returns: the wrapped innovations (n,) [rad] and their normalised square (NIS).
+        :param gate: largest normalised square of a sensor's innovation that is used.
+        :returns: the wrapped innovations (n,) [rad], the normalised square (NIS) of those that
+            were used, and which were (n,).
         """
-        self.y, self.S, self.SI, self.K, nis = correct(
-            self.x, self.P, self.angles, self._to_links, np.array(links), measured, variance,
-            self._constants, self._state)
-        self.x_post, self.P_post = self.x.copy(), self.P.copy()
-        return self.y, nis
+        self.y, self.S, self.SI, self.K, nis, used = correct(
+            self.x, self.P, self.angles, self._to_links, np.array(sensors), measured, variance,
+            gate, self._constants, self._state)
+        return self.y, nis, used
 
 
 @kernel
 def predict(x: Array, covariance: Array, angles: Array, to_links: Array, wheel_torques: Array,
-            duration: float, disturbance: float, constants: Constants, scratch: Array,
-            state: Array, transition: Array, noise: Array) -> None:
+            duration: float, disturbance: float, boxed: NDArray[np.record], state: Array,
+            transition: Array, noise: Array) -> None:
     """
     Predict in place: filterpy's `predict` with the linkage as the model.
 
     :param x, covariance: (4,) and (4, 4), the filter's.
     :param angles: (4,) link angles that belong to x [rad].
     :param to_links: (4, 2) from links a, b to all four; its lower half is Gamma.
+    :param boxed: (1,) constants of the mechanism.
     :param transition, noise: (4, 4) receive F and Q.
     """
+    constants = boxed[0]
     gamma = to_links[2:]
-    linearise(angles, x[2:], gamma, wheel_torques, duration, disturbance, constants, scratch,
+    linearise(angles, x[2:], gamma, wheel_torques, duration, disturbance, constants,
               state, transition, noise)
-    move_links(angles, x[2:], gamma, wheel_torques, duration, constants, scratch, state)
+    move_links(angles, x[2:], gamma, wheel_torques, duration, constants, state)
     # P = F P F' + Q
     covariance[:] = transition @ covariance @ transition.T + noise
     _take_over(state, x, angles, to_links, constants.lengths)
 
 
 @kernel
-def correct(x: Array, covariance: Array, angles: Array, to_links: Array, links: Array,
-            measured: Array, variance: float, constants: Constants, state: Array
-            ) -> tuple[Array, Array, Array, Array, float]:
+def correct(x: Array, covariance: Array, angles: Array, to_links: Array,
+            sensors: NDArray[np.int64], measured: Array, variance: float, gate: float,
+            boxed: NDArray[np.record], state: Array
+            ) -> tuple[Array, Array, Array, Array, float, NDArray[np.bool_]]:
     """
     Correct in place: filterpy's `update`, with wrapped innovations.
 
     Parameters as in :func:`predict` and :meth:`LinkageFilter.correct`.
 
-    :returns: y (n,), S (n, n), its inverse, K (4, n) and the normalised innovation squared.
+    :returns: y (n,); of the m sensors within the gate S (m, m), its inverse, K (4, m) and the
+        normalised innovation squared; and which they are (n,).
     """
-    count = links.size
+    constants = boxed[0]
+    count = sensors.size
     jacobian = np.zeros((count, 4))
     y = np.empty(count)
     for row in range(count):
-        jacobian[row, :2] = to_links[links[row]]
-        y[row] = pi - (pi - measured[row] + angles[links[row]]) % (2.0 * pi)
-    noise = variance * np.eye(count)
+        predicted = 0.0
+        for link in range(4):
+            share = SENSOR_ROWS[sensors[row], link]
+            predicted += share * angles[link]
+            jacobian[row, 0] += share * to_links[link, 0]
+            jacobian[row, 1] += share * to_links[link, 1]
+        y[row] = pi - (pi - measured[row] + predicted) % (2.0 * pi)
     # S = H P H' + R, K = P H' S^-1
-    s = jacobian @ covariance @ jacobian.T + noise
+    s = jacobian @ covariance @ jacobian.T + variance * np.eye(count)
+    used = np.empty(count, np.bool_)
+    many = 0
+    for row in range(count):
+        used[row] = y[row] * y[row] <= gate * s[row, row]
+        many += used[row]
+    if many == 0:
+        nothing = np.zeros((0, 0))
+        return y, nothing, nothing, np.zeros((4, 0)), 0.0, used
+    good = y
+    if many < count:
+        good, jacobian = y[used], jacobian[used]
+        s = jacobian @ covariance @ jacobian.T + variance * np.eye(many)
+    noise = variance * np.eye(many)
     inverse = np.linalg.inv(s)
     gain = covariance @ jacobian.T @ inverse
-    change = gain @ y
+    change = gain @ good
     x += change
     # P = (I - K H) P (I - K H)' + K R K'
     rest = np.eye(4) - gain @ jacobian
     covariance[:] = rest @ covariance @ rest.T + gain @ noise @ gain.T
     state[0:4] = angles + to_links @ change[:2]
     state[4:8] = to_links @ x[2:]
-    project_onto_closure(state[0:4], state[4:8], constants)
+    meet_closure(state, constants)
     _take_over(state, x, angles, to_links, constants.lengths)
-    return y, s, inverse, gain, float(y @ inverse @ y)
+    return y, s, inverse, gain, float(good @ inverse @ good), used
+
+
+@kernel
+def link_sigmas(covariance: Array, to_links: Array) -> tuple[Array, Array]:
+    """Evaluate one standard deviation of angles and rates of the four links: two (4,)."""
+    sigmas = np.empty((2, 4))
+    for half in range(2):
+        first = 2 * half
+        for link in range(4):
+            a, b = to_links[link, 0], to_links[link, 1]
+            sigmas[half, link] = sqrt(
+                a * a * covariance[first, first] + b * b * covariance[first + 1, first + 1]
+                + a * b * (covariance[first, first + 1] + covariance[first + 1, first]))
+    return sigmas[0], sigmas[1]
 
 
 @kernel
@@ -189,27 +240,26 @@ def _take_over(state: Array, x: Array, angles: Array, to_links: Array, lengths: 
 
 @kernel
 def move_links(angles: Array, rates: Array, gamma: Array, wheel_torques: Array, duration: float,
-               constants: Constants, scratch: Array, state: Array) -> None:
+               constants: Constants, state: Array) -> None:
     """
     Integrate the links, wheels locked, under minus the torques that moved the wheels.
 
     :param angles: (4,) [rad].
     :param rates: (2,) of links a and b [rad/s].
-    :param state: (16,) receives angles and rates of the links.
+    :param state: (STATE_SIZE,) receives angles and rates of the links.
     """
     state[:] = 0.0
     state[0:4] = angles
     state[4:6] = rates
     state[6] = gamma[0, 0] * rates[0] + gamma[0, 1] * rates[1]
     state[7] = gamma[1, 0] * rates[0] + gamma[1, 1] * rates[1]
-    advance_state(state, wheel_torques, wheel_torques, wheel_torques, duration, constants, scratch)
+    advance_state(state, wheel_torques, wheel_torques, wheel_torques, duration, constants, NOTHING)
 
 
 @kernel
 def linearise(
     angles: Array, rates: Array, gamma: Array, wheel_torques: Array, duration: float,
-    disturbance: float, constants: Constants, scratch: Array, state: Array, transition: Array,
-    noise: Array,
+    disturbance: float, constants: Constants, state: Array, transition: Array, noise: Array,
 ) -> None:
     """
     Evaluate transition matrix and process noise of :func:`move_links`.
@@ -233,7 +283,7 @@ def linearise(
                 trial_gamma[:] = gamma
                 trial_rates[column - 2] += sign * DIFFERENCE
             move_links(trial_angles, trial_rates, trial_gamma, wheel_torques, duration, constants,
-                       scratch, state)
+                       state)
             for row in range(4):
                 # Angles a, b are state[0:2], rates a, b are state[4:6].
                 end = state[row] if row < 2 else state[row + 2]

@@ -21,14 +21,15 @@ and time is simulated.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 from fourbar_ros.control import Control, Controller
 from fourbar_ros.device import Samples, Testbed
+from fourbar_ros.device.pacing import FIRST_STAMP_NS
 from fourbar_ros.estimation import Estimate, Estimator
-from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES
-
-FIRST_STAMP_NS = 1_000_000_000
+from fourbar_ros.mechanism import FLYWHEEL_NAMES
+from fourbar_ros.mechanism.by_name import RejectedError
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +59,8 @@ class ClosedLoop:
         """
         Go through one tick: device, estimator, controller, command.
 
+        What one of them rejects it counts, and the others go on without it.
+
         :raises FourbarError: the device failed.
         """
         stamp_ns = self._next_ns
@@ -66,15 +69,20 @@ class ClosedLoop:
         self.testbed.published(stamp_ns, 0)
         self.controller.device_armed(self.testbed.gate.armed)
         for sample in samples.links:
-            self.estimator.measure(
-                sample.stamp_ns, [LINK_NAMES[link] for link in sample.links], list(sample.angles))
-        estimate = self.estimator.tick(stamp_ns, list(samples.wheels.speeds))
+            with suppress(RejectedError):
+                self.estimator.measure(
+                    sample.stamp_ns, sample.names, sample.angles.tolist())
+        estimate = None
+        with suppress(RejectedError):
+            estimate = self.estimator.tick(stamp_ns, samples.wheels.speeds)
         if estimate is None:
             return Step(samples, None, None)
         control = self.controller.tick(
             stamp_ns, estimate.link_angles, estimate.link_rates, samples.wheels.speeds,
             samples.wheels.efforts)
-        self.testbed.command(stamp_ns, FLYWHEEL_NAMES, (), (), list(control.torques), stamp_ns)
+        with suppress(RejectedError):
+            self.testbed.command(
+                stamp_ns, FLYWHEEL_NAMES, (), (), control.torques.tolist(), stamp_ns)
         return Step(samples, estimate, control)
 
     def arm(self) -> tuple[bool, str]:

@@ -16,18 +16,16 @@
 
 from __future__ import annotations
 
-from threading import Timer
+import sys
 
 from fourbar_ros.control import Controller, ControllerSettings
 from fourbar_ros.device import SimulatedTable, Testbed, TestbedSettings
 from fourbar_ros.estimation import Estimator, EstimatorSettings
 from fourbar_ros.loop.closed_loop import ClosedLoop
 from fourbar_ros.mechanism import load_mechanism
+from fourbar_ros.mechanism.compiled import announced
 from fourbar_ros.plant import InitialState, load_table, Plant
 import numpy as np
-
-# Loading compiled code takes less than this [s].
-NOTICE_AFTER = 1.0
 
 
 def warm_up() -> None:
@@ -43,11 +41,8 @@ def warm_up() -> None:
 
 def main() -> None:
     """Compile, and say so if there is something to compile."""
-    notice = Timer(NOTICE_AFTER, print, ['Compiling the kernels, once (about 15 s)'],
-                   {'flush': True})
-    notice.start()
-    warm_up()
-    notice.cancel()
+    with announced(sys.stdout):
+        warm_up()
 
 
 if __name__ == '__main__':

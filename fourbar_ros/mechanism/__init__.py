@@ -35,15 +35,18 @@ from fourbar_ros.mechanism.dynamics import (
 from fourbar_ros.mechanism.geometry import com_positions_in_table, joint_positions
 from fourbar_ros.mechanism.parameters import (
     FLYWHEEL_NAMES,
+    JOINT_LINKS,
+    JOINT_NAMES,
     LINK_NAMES,
     load_mechanism,
     Mechanism,
     MechanismError,
+    SENSOR_NAMES,
 )
 
 __all__ = [
     'angular_momentum', 'assemble', 'branch_of', 'closure_error', 'ClosureError',
-    'com_positions_in_table', 'FLYWHEEL_NAMES', 'joint_positions', 'kinetic_energy',
-    'LINK_NAMES', 'load_mechanism', 'Mechanism', 'MechanismError', 'nearest_assembly',
-    'reduced_form', 'ReducedForm',
+    'com_positions_in_table', 'FLYWHEEL_NAMES', 'JOINT_LINKS', 'JOINT_NAMES', 'joint_positions',
+    'kinetic_energy', 'LINK_NAMES', 'load_mechanism', 'Mechanism', 'MechanismError',
+    'nearest_assembly', 'reduced_form', 'ReducedForm', 'SENSOR_NAMES',
 ]

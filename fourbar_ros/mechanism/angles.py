@@ -18,14 +18,17 @@ from __future__ import annotations
 
 from math import pi
 
-from fourbar_ros.mechanism.parameters import Array
+from fourbar_ros.mechanism.constants import Array
 import numpy as np
 from numpy.typing import ArrayLike
 
 
 def wrap(angle: float) -> float:
     """Bring an angle [rad] into (-pi, pi]."""
-    return float(wrap_angles(angle))
+    if -pi < angle <= pi:
+        return float(angle)
+    wrapped = pi - (pi - angle) % (2.0 * pi)
+    return float(pi if wrapped <= -pi else wrapped)
 
 
 def wrap_angles(angles: ArrayLike) -> Array:

@@ -18,34 +18,33 @@ A motion to simulate, described by a file: mechanism, initial state, motor torqu
 The file is JSON with the keys `mechanism` (those of a mechanism file), `initial` (`link_angles`,
 and optionally `link_rates` and `flywheel_speeds_absolute`), `motor_torque` (`amplitude`,
 `frequency_hz`, `phase`: torque on the wheel = amplitude cos(2 pi frequency_hz t + phase)) and `t`.
-Other keys are ignored, so that a file may carry its expected result.
+With `wheel_angle` (`flywheels`, and for each of them `amplitude`, `frequency_hz`, `phase`) some
+wheels move relative to their links as prescribed, instead of being driven by a torque. Other keys
+are ignored, so that a file may carry its expected result.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import json
 from pathlib import Path
 from typing import Any
 
 from fourbar_ros.errors import FourbarError
-from fourbar_ros.mechanism.closure import closure_error
-from fourbar_ros.mechanism.dynamics import closure_jacobian
-from fourbar_ros.mechanism.motion import (
+from fourbar_ros.mechanism.closure import branch_of, check_motion, ClosureError
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.forces import NOTHING, Surroundings
+from fourbar_ros.mechanism.layout import (
     LINK_ANGLES,
     LINK_RATES,
-    move_with_cosine_torques,
-    STATE_SIZE,
+    make_state,
     WHEEL_ANGLES,
     WHEEL_SPEEDS,
 )
-from fourbar_ros.mechanism.parameters import Array, LINK_NAMES, Mechanism, numbers
+from fourbar_ros.mechanism.motion import move_with_cosines
+from fourbar_ros.mechanism.parameters import FLYWHEEL_NAMES, LINK_NAMES, Mechanism, numbers
 import numpy as np
-
-# How far an initial state may be off the closure, relative to the longest link (and per second):
-# generous to files with rounded digits, far below any real mistake.
-CLOSURE_TOLERANCE = 1e-6
 
 DEFAULT_STEP = 1e-3
 
@@ -63,10 +62,13 @@ class Case:
     :param link_angles: (4,) initial angles on the closure [rad].
     :param link_rates: (4,) initial rates consistent with the closure [rad/s].
     :param flywheel_speeds_absolute: (4,) initial link rate plus wheel speed [rad/s].
-    :param amplitude: (4,) of the motor torques [N m].
+    :param amplitude: (4,) of the motor torques [N m], or of the prescribed wheel angles [rad].
     :param frequency_hz: (4,) [Hz].
     :param phase: (4,) [rad].
     :param times: (n,) increasing, the first one is that of the initial state [s].
+    :param prescribed: (4,) bool, wheels whose angle relative to the link is
+        `amplitude cos(2 pi frequency_hz t + phase)`, up to a constant. Their initial speed follows
+        from it.
     """
 
     mechanism: Mechanism
@@ -77,6 +79,7 @@ class Case:
     frequency_hz: Array
     phase: Array
     times: Array
+    prescribed: Array = field(default_factory=lambda: np.zeros(4, dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +99,15 @@ class Motion:
     link_rates: Array
     flywheel_angles: Array
     flywheel_speeds_absolute: Array
+
+    def branches(self) -> list[tuple[float, str]]:
+        """Tell on which branch the linkage was: from which time [s] on, and which."""
+        changes: list[tuple[float, str]] = []
+        for time, angles in zip(self.times, self.link_angles):
+            branch = branch_of(angles)
+            if not changes or branch != changes[-1][1]:
+                changes.append((float(time), branch))
+        return changes
 
 
 def load_case(path: Path) -> Case:
@@ -118,20 +130,23 @@ def load_case(path: Path) -> Case:
         raise CaseError(f'{path}: {error}') from None
 
 
-def simulate(case: Case, step: float = DEFAULT_STEP) -> Motion:
+def simulate(case: Case, step: float = DEFAULT_STEP, around: Surroundings = NOTHING) -> Motion:
     """
     Integrate the motion of a case.
 
     :param step: longest integration step [s].
+    :param around: what acts besides the motors.
+    :raises ClosureError: the linkage cannot be in the initial state.
     :raises CaseError: the motion left the finite numbers.
     """
-    state = np.zeros(STATE_SIZE)
-    state[LINK_ANGLES] = case.link_angles
-    state[LINK_RATES] = case.link_rates
-    state[WHEEL_SPEEDS] = case.flywheel_speeds_absolute
-    states = move_with_cosine_torques(
+    check_motion(case.mechanism, case.link_angles, case.link_rates)
+    omega = 2.0 * np.pi * case.frequency_hz
+    prescribed_speeds = -case.amplitude * omega * np.sin(omega * case.times[0] + case.phase)
+    state = make_state(case.link_angles, case.link_rates, np.where(
+        case.prescribed, case.link_rates + prescribed_speeds, case.flywheel_speeds_absolute))
+    states = move_with_cosines(
         state, case.times, case.amplitude, case.frequency_hz, case.phase, step,
-        case.mechanism.constants)
+        case.mechanism.constants_with(case.prescribed), around)
     finite = np.isfinite(states).all(axis=1)
     if not finite.all():
         raise CaseError(
@@ -145,35 +160,53 @@ def simulate(case: Case, step: float = DEFAULT_STEP) -> Motion:
 def _case_from(values: Any, origin: str) -> Case:
     mechanism = Mechanism.from_mapping(_section(values, 'mechanism'), f'{origin}, mechanism')
     initial = _section(values, 'initial')
-    torque = _section(values, 'motor_torque')
     zeros = [0.0, 0.0, 0.0, 0.0]
+    cosines, prescribed = _wheel_cosines(values)
     case = Case(
         mechanism,
         _array(initial, 'link_angles', (4,)),
         _array({'link_rates': zeros, **initial}, 'link_rates', (4,)),
         _array({'flywheel_speeds_absolute': zeros, **initial}, 'flywheel_speeds_absolute', (4,)),
-        _array(torque, 'amplitude', (4,)),
-        _array(torque, 'frequency_hz', (4,)),
-        _array(torque, 'phase', (4,)),
-        _array(values, 't', None))
+        cosines[0], cosines[1], cosines[2], _array(values, 't', None), prescribed)
     if case.times.size < 2 or not (np.diff(case.times) > 0.0).all():
         raise CaseError('t must hold at least two increasing times')
-    _check_closure(case)
+    try:
+        check_motion(mechanism, case.link_angles, case.link_rates)
+    except ClosureError as error:
+        raise CaseError(f'initial: {error}') from None
     return case
 
 
-def _check_closure(case: Case) -> None:
-    limit = CLOSURE_TOLERANCE * float(case.mechanism.link_lengths.max())
-    gap = closure_error(case.mechanism, case.link_angles)
-    if gap > limit:
-        raise CaseError(
-            f'initial link_angles do not close the loop: gap {gap:.3g} m, limit {limit:.3g} m')
-    jacobian = closure_jacobian(case.link_angles, case.mechanism.constants.lengths)
-    slip = float(np.hypot(*(jacobian @ case.link_rates)))
-    if slip > limit:
-        raise CaseError(
-            'initial link_rates do not keep the loop closed: joint 3 would open at '
-            f'{slip:.3g} m/s, limit {limit:.3g} m/s')
+def _wheel_cosines(values: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Read amplitudes, frequencies and phases (3, 4), and which wheels are prescribed (4,)."""
+    names = ('amplitude', 'frequency_hz', 'phase')
+    prescribed = np.zeros(4, dtype=bool)
+    wheels: list[int] = []
+    if 'wheel_angle' in values:
+        wheels = _wheels(_section(values, 'wheel_angle').get('flywheels'))
+        prescribed[wheels] = True
+    cosines = np.zeros((3, 4))
+    if 'motor_torque' in values or not prescribed.all():
+        torque = _section(values, 'motor_torque')
+        cosines[:] = [_array(torque, name, (4,)) for name in names]
+        if wheels and cosines[0, wheels].any():
+            moved = wheels[int(np.argmax(cosines[0, wheels] != 0.0))]
+            raise CaseError(
+                f'{FLYWHEEL_NAMES[moved]} has a prescribed angle and a motor torque: only one of '
+                'the two can be given')
+    if wheels:
+        angle = values['wheel_angle']
+        cosines[:, wheels] = [_array(angle, name, (len(wheels),)) for name in names]
+    return cosines, prescribed
+
+
+def _wheels(names: Any) -> list[int]:
+    if not isinstance(names, list) or not names or len(set(map(str, names))) < len(names):
+        raise CaseError(f'wheel_angle needs flywheels, a list of different names, got {names!r}')
+    if unknown := [name for name in names if name not in FLYWHEEL_NAMES]:
+        raise CaseError(f'wheel_angle: no flywheel {unknown[0]!r} (known are '
+                        f'{", ".join(FLYWHEEL_NAMES)})')
+    return [FLYWHEEL_NAMES.index(name) for name in names]
 
 
 def _section(values: Any, name: str) -> Mapping[str, Any]:
@@ -190,7 +223,10 @@ def _array(values: Mapping[str, Any], name: str, shape: tuple[int, ...] | None) 
         raise CaseError(f'{name} is missing')
     array = numbers(name, values[name], CaseError)
     if array.ndim != 1 or (shape is not None and array.shape != shape):
-        wanted = f'{shape[0]} numbers, in the order {", ".join(LINK_NAMES)}' if shape else 'a list'
+        wanted = 'a list'
+        if shape:
+            wanted = f'{shape[0]} number{"s" * (shape[0] > 1)}' + (
+                f', in the order {", ".join(LINK_NAMES)}' if shape == (4,) else '')
         raise CaseError(f'{name} must be {wanted}, got shape {array.shape}')
     if not np.isfinite(array).all():
         raise CaseError(f'{name} must be finite, got {array[~np.isfinite(array)][0]}')

@@ -24,10 +24,12 @@ where c and d fold onto a line (a change point).
 from __future__ import annotations
 
 from math import acos, atan2, cos, hypot, isfinite, pi, sin
+from operator import itemgetter
 
 from fourbar_ros.errors import FourbarError
-from fourbar_ros.mechanism.angles import wrap, wrap_angles
-from fourbar_ros.mechanism.parameters import Array, LINK_NAMES, Mechanism
+from fourbar_ros.mechanism.angles import wrap
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.parameters import LINK_NAMES, Mechanism
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -35,6 +37,14 @@ BRANCHES = ('open', 'crossed')
 
 # Each link's sign in the closure written as a sum that vanishes.
 SIGNS = (-1.0, 1.0, 1.0, -1.0)
+
+
+# Sine of the angle within which two links count as lying on each other.
+FOLDED = 1e-6
+
+# How far a given state may be off the closure, relative to the longest link (and per second):
+# generous to rounded digits, far below any real mistake.
+TOLERANCE = 1e-6
 
 
 class ClosureError(FourbarError):
@@ -57,11 +67,43 @@ def branch_of(link_angles: ArrayLike) -> str:
     """
     Tell which assembly the linkage is in.
 
+    A third one exists where l_a = l_b and l_c = l_d: joint 4 lies on joint 2, and the links turn
+    as two pairs, a with b and c with d.
+
     :param link_angles: (4,) [rad].
-    :returns: `open` or `crossed`; exactly on a change point, where both meet, `open`.
+    :returns: `open`, `crossed` or `folded`; exactly on a change point, where they meet, `open`.
     """
     a, b, c, d = np.asarray(link_angles, dtype=float)
+    if abs(sin(b - a)) < FOLDED and abs(sin(d - c)) < FOLDED:
+        return 'folded' if abs(sin(c - a)) > FOLDED else 'open'
     return 'crossed' if sin(b - a) * sin(d - c) < 0.0 else 'open'
+
+
+def check_motion(mechanism: Mechanism, link_angles: ArrayLike, link_rates: ArrayLike) -> None:
+    """
+    Refuse a state that the linkage cannot be in.
+
+    :param link_angles: (4,) [rad].
+    :param link_rates: (4,) [rad/s].
+    :raises ClosureError: a value is not finite, the loop is open by more than `TOLERANCE` of the
+        longest link, or opens faster than that per second.
+    """
+    angles, rates = (np.asarray(values, dtype=float) for values in (link_angles, link_rates))
+    for name, values, unit in (('angle', angles, 'rad'), ('rate', rates, 'rad/s')):
+        if not np.isfinite(values).all():
+            n = int(np.argmin(np.isfinite(values)))
+            raise ClosureError(f'the {name} of {LINK_NAMES[n]} must be finite, got {values[n]} '
+                               f'{unit}')
+    limit = TOLERANCE * float(mechanism.link_lengths.max())
+    gap = closure_error(mechanism, angles)
+    if gap > limit:
+        raise ClosureError(f'the link angles do not close the loop: gap {gap:.3g} m, limit '
+                           f'{limit:.3g} m')
+    arms = np.array(SIGNS) * mechanism.link_lengths * rates
+    slip = hypot(float(arms @ np.sin(angles)), float(arms @ np.cos(angles)))
+    if slip > limit:
+        raise ClosureError('the link rates do not keep the loop closed: joint 3 would open at '
+                           f'{slip:.3g} m/s, limit {limit:.3g} m/s')
 
 
 def assemble(
@@ -109,13 +151,17 @@ def assemblies(
     :returns: two arrays (4,) of link angles, the one nearer to the given ones first [rad].
     :raises ClosureError: the loop cannot close, or the two links do not determine it.
     """
-    reference = np.asarray(near, dtype=float)
+    # Plain numbers: arrays of four cost ten times as much, and this is called at every tick.
+    reference: list[float] = np.asarray(near, dtype=float).tolist()
     completed = []
-    for solution in solve_pair(mechanism, known, angles):
-        result = reference + wrap_angles(solution - reference)
-        result[list(known)] = angles
-        completed.append(result)
-    return sorted(completed, key=lambda result: float(np.abs(result - reference).sum()))
+    for solution in _solve_pair(mechanism, known, angles):
+        result = [begin + wrap(angle - begin) for angle, begin in zip(solution, reference)]
+        for link, angle in zip(known, angles):
+            result[link] = float(angle)
+        a, b, c, d = (abs(angle - begin) for angle, begin in zip(result, reference))
+        completed.append((a + b + c + d, result))
+    completed.sort(key=itemgetter(0))
+    return [np.array(result) for _, result in completed]
 
 
 def assemble_along(mechanism: Mechanism, phi_a: Array, phi_b: Array, start: ArrayLike) -> Array:
@@ -161,24 +207,31 @@ def solve_pair(
     :returns: two arrays (4,) of link angles [rad], the worked out ones in (-pi, pi].
     :raises ClosureError: the loop cannot close, or the two links do not determine it.
     """
+    return [np.array(solution) for solution in _solve_pair(mechanism, known, angles)]
+
+
+def _solve_pair(
+    mechanism: Mechanism, known: tuple[int, int], angles: tuple[float, float],
+) -> list[list[float]]:
     i, j = known
     k, m = (index for index in range(4) if index not in known)
-    lengths = mechanism.link_lengths
-    if not all(map(isfinite, angles)):
+    lengths: list[float] = mechanism.link_lengths.tolist()
+    if not (isfinite(angles[0]) and isfinite(angles[1])):
         raise ClosureError(f'link angles must be finite, got {angles[0]} and {angles[1]}')
-    names = f'{LINK_NAMES[i]} = {angles[0]:.4f} rad and {LINK_NAMES[j]} = {angles[1]:.4f} rad'
     # s_k l_k e_k + s_m l_m e_m = gap: a triangle with sides l_k, l_m and the gap.
-    gap_x = -sum(SIGNS[n] * lengths[n] * cos(angle) for n, angle in zip(known, angles))
-    gap_y = -sum(SIGNS[n] * lengths[n] * sin(angle) for n, angle in zip(known, angles))
+    arm_i, arm_j = SIGNS[i] * lengths[i], SIGNS[j] * lengths[j]
+    gap_x = -(arm_i * cos(angles[0]) + arm_j * cos(angles[1]))
+    gap_y = -(arm_i * sin(angles[0]) + arm_j * sin(angles[1]))
     gap = hypot(gap_x, gap_y)
-    side_k, side_m = float(lengths[k]), float(lengths[m])
+    side_k, side_m = lengths[k], lengths[m]
     if gap < 1e-9 * (side_k + side_m):
-        raise ClosureError(f'{names} do not determine the configuration')
+        raise ClosureError(f'{_named(known, angles)} do not determine the configuration')
     cosine = (gap * gap + side_k * side_k - side_m * side_m) / (2.0 * gap * side_k)
     if abs(cosine) > 1.0 + 1e-12:
         raise ClosureError(
-            f'the loop cannot close at {names}: {LINK_NAMES[k]} and {LINK_NAMES[m]} reach '
-            f'{abs(side_k - side_m):g} to {side_k + side_m:g} m, needed are {gap:g} m')
+            f'the loop cannot close at {_named(known, angles)}: {LINK_NAMES[k]} and '
+            f'{LINK_NAMES[m]} reach {abs(side_k - side_m):g} to {side_k + side_m:g} m, needed are '
+            f'{gap:g} m')
     spread = acos(max(-1.0, min(1.0, cosine)))
     solutions = []
     for side in (1.0, -1.0):
@@ -187,9 +240,15 @@ def solve_pair(
         phi_k = direction if SIGNS[k] > 0 else direction + pi
         rest_x = (gap_x - side_k * cos(direction)) * SIGNS[m]
         rest_y = (gap_y - side_k * sin(direction)) * SIGNS[m]
-        solution = np.empty(4)
-        solution[[i, j]] = angles
+        solution = [0.0] * 4
+        solution[i], solution[j] = float(angles[0]), float(angles[1])
         solution[k] = wrap(phi_k)
         solution[m] = wrap(atan2(rest_y, rest_x))
         solutions.append(solution)
     return solutions
+
+
+def _named(known: tuple[int, int], angles: tuple[float, float]) -> str:
+    """Name two given link angles."""
+    return ' and '.join(f'{LINK_NAMES[link]} = {angle:.4f} rad'
+                        for link, angle in zip(known, angles))

@@ -32,17 +32,22 @@ import platform
 import re
 import shutil
 import stat
+import sys
 import tempfile
 import time
-from typing import Any, overload, TypeVar
+from typing import Any, overload, TextIO, TypeVar
 
 import numba
+from numba.core import event
 import numpy
 
 # Kernels live in these rooms and call nothing outside them.
 ROOMS = ('mechanism', 'plant', 'estimation', 'control')
 UNUSED_AFTER = 30 * 24 * 3600.0
 """Seconds after which the code of other versions is dropped."""
+
+prange = numba.prange
+"""The parallel range of a kernel compiled with `parallel=True`."""
 
 _OPTIONS = {'error_model': 'numpy', 'fastmath': False}
 _Function = TypeVar('_Function', bound=Callable[..., Any])
@@ -69,6 +74,49 @@ def kernel(function: _Function | None = None, /, **options: Any) -> Any:
     options = {'cache': directory is not None, **_OPTIONS, **options}
     with _numba_caches_in(directory):
         return numba.njit(**options)(function)
+
+
+@contextlib.contextmanager
+def announced(stream: TextIO | None = None) -> Iterator[None]:
+    """
+    Say it, while the block runs, when kernels have to be compiled, and which.
+
+    Nothing is said where the machine code comes from the cache. On a terminal one line shows the
+    kernel at work and is wiped at the end.
+
+    :param stream: where to, by default stderr.
+    """
+    show = _Announcement(stream or sys.stderr)
+    with event.install_listener('numba:compile', show):
+        try:
+            yield
+        finally:
+            show.finish()
+
+
+class _Announcement(event.Listener):  # type: ignore[misc]
+    """Shows the outermost function that is being compiled."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._done = 0
+
+    def on_start(self, occasion: event.Event) -> None:
+        if not self._done:
+            print('Compiling the kernels, once after an installation (half a minute)',
+                  file=self._stream, flush=True)
+        self._done += 1
+        if self._stream.isatty():
+            name = occasion.data['dispatcher'].__name__
+            print(f'\r  {self._done:3d} {name:<40}', end='', file=self._stream, flush=True)
+
+    def on_end(self, occasion: event.Event) -> None:
+        """Leave the line: the next kernel overwrites it."""
+
+    def finish(self) -> None:
+        """Wipe the line."""
+        if self._done and self._stream.isatty():
+            print(f'\r{"":<44}\r', end='', file=self._stream, flush=True)
 
 
 @functools.lru_cache(maxsize=None)

@@ -16,7 +16,8 @@
 
 from __future__ import annotations
 
-from fourbar_ros.mechanism.parameters import Array, Mechanism
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.parameters import Mechanism
 import numpy as np
 from numpy.typing import ArrayLike
 

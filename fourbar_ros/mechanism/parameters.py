@@ -17,46 +17,52 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 from fourbar_ros.configuration import check_keys, config_file, load_yaml
 from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism.constants import Array, Constants, constants_of
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 LINK_NAMES = ('link_a', 'link_b', 'link_c', 'link_d')
 FLYWHEEL_NAMES = ('flywheel_a', 'flywheel_b', 'flywheel_c', 'flywheel_d')
+JOINT_NAMES = ('joint_1', 'joint_2', 'joint_3', 'joint_4')
 
-Array = NDArray[np.float64]
+# What may be measured: orientations of links, and angles in joints.
+SENSOR_NAMES = (*LINK_NAMES, *JOINT_NAMES)
+
+# First and second link of each joint; an encoder there measures the second relative to the first.
+JOINT_LINKS = ((0, 1), (1, 2), (2, 3), (3, 0))
+
+# Which links line up against the others at a change point: a and d against b and c (parallelogram,
+# theta = 0), a and b against c and d (theta = pi), a and c against b and d.
+CHANGE_POINTS = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
+# Lengths that match this closely, relative to their mean, are made to match. No linkage is made
+# so well; in between, double precision resolves neither a passage nor a fold.
+MATCHING = 1e-8
+# What adding up the lengths rounds off is no mismatch.
+ROUNDING = 1e-15
+
+
+# Least values of those that need not be positive.
+LOWEST = {'com_positions': -np.inf, 'joint_damping': 0.0, 'motor_time_constants': 0.0,
+          'motor_resistances': 0.0}
 
 
 class MechanismError(FourbarError):
     """A mechanism that cannot exist or is not fully described."""
 
 
-class Constants(NamedTuple):
-    """
-    What the compiled kernels need of a mechanism, worked out once.
-
-    The position of every mass centre, relative to that of the whole, is linear in the four
-    rotations of the links. Hence the mass matrix of the four link angles is
-    `M_jk = cosine_jk cos(phi_k - phi_j) + sine_jk sin(phi_k - phi_j)`
-    with constant `cosine` (symmetric, link inertias on the diagonal) and `sine` (antisymmetric).
-    """
-
-    lengths: Array            # (4,) m
-    cosine: Array             # (4, 4) kg m^2
-    sine: Array               # (4, 4) kg m^2
-    flywheel_inertias: Array  # (4,) kg m^2
-    total_mass: float         # kg
-
-
 @dataclass(frozen=True, eq=False)
 class Mechanism:
     """
     A closed loop of four rigid links, one flywheel on each (order a, b, c, d; SI units).
+
+    Lengths that miss a change point, where all links lie on a line, by less than `MATCHING` are
+    made to meet it.
 
     :param link_lengths: (4,) distance between the two joints of each link [m].
     :param link_masses: (4,) mass of each link with its flywheel [kg].
@@ -67,7 +73,17 @@ class Mechanism:
     :param motor_torque_limits: (4,) largest torque of each motor [N m], default unlimited.
     :param motor_speed_limits: (4,) largest wheel speed relative to the link [rad/s], default
         unlimited.
-    :raises MechanismError: wrong shape, not finite, not positive, or lengths that cannot close.
+    :param motor_time_constants: (4,) with which the torque follows what is asked for [s],
+        default 0.
+    :param motor_torque_constants: (4,) torque per current, and voltage per speed [N m/A, V s/rad],
+        default infinite: no current flows.
+    :param motor_resistances: (4,) of the windings [ohm], default 0.
+    :param motor_voltages: (4,) of the supply [V], default unlimited.
+    :param joint_stiffness: (4,) how hard the two ends in joints 1 to 4 are pulled together [N/m],
+        default infinite: rigid. Either all four joints are rigid or none.
+    :param joint_damping: (4,) of the same, for joints that are not rigid [N s/m], default 0.
+    :raises MechanismError: wrong shape, not finite, not positive, lengths that cannot close, or
+        joints of which only some are rigid.
     """
 
     link_lengths: Array
@@ -77,6 +93,12 @@ class Mechanism:
     flywheel_inertias: Array
     motor_torque_limits: Array = field(default_factory=lambda: np.full(4, np.inf))
     motor_speed_limits: Array = field(default_factory=lambda: np.full(4, np.inf))
+    motor_time_constants: Array = field(default_factory=lambda: np.zeros(4))
+    motor_torque_constants: Array = field(default_factory=lambda: np.full(4, np.inf))
+    motor_resistances: Array = field(default_factory=lambda: np.zeros(4))
+    motor_voltages: Array = field(default_factory=lambda: np.full(4, np.inf))
+    joint_stiffness: Array = field(default_factory=lambda: np.full(4, np.inf))
+    joint_damping: Array = field(default_factory=lambda: np.zeros(4))
 
     def __post_init__(self) -> None:
         """Check every value and make every array read-only."""
@@ -85,6 +107,9 @@ class Mechanism:
             array = _checked_array(item.name, getattr(self, item.name), shape)
             object.__setattr__(self, item.name, array)
         self._check_that_it_closes()
+        self._match_lengths()
+        self._check_joints()
+        self._check_windings()
 
     def _check_that_it_closes(self) -> None:
         longest = int(np.argmax(self.link_lengths))
@@ -94,34 +119,54 @@ class Mechanism:
                 f'link_lengths cannot close: {LINK_NAMES[longest]} is '
                 f'{self.link_lengths[longest]:g} m long, the other three reach {others:g} m')
 
-    @cached_property
-    def constants(self) -> Constants:
-        """Work out what the kernels need, see :class:`Constants`."""
-        share = self.link_masses / self.link_masses.sum()
-        # arm[i, j]: the mass centre of link i is the sum over j of R(phi_j) arm[i, j],
-        # measured from joint 1; c hangs on b (joint 2), d hangs on a (joint 4).
-        arm = np.zeros((4, 4, 2))
-        arm[range(4), range(4)] = self.com_positions
-        arm[2, 1, 0] = self.link_lengths[1]
-        arm[3, 0, 0] = self.link_lengths[0]
-        arm -= np.einsum('i,ijx->jx', share, arm)
-        x, y = arm[..., 0], arm[..., 1]
-        masses = self.link_masses
-        cosine = np.einsum('i,ij,ik->jk', masses, x, x) + np.einsum('i,ij,ik->jk', masses, y, y)
-        sine = np.einsum('i,ij,ik->jk', masses, y, x) - np.einsum('i,ij,ik->jk', masses, x, y)
-        cosine[range(4), range(4)] += self.link_inertias
-        for matrix in (cosine, sine):
-            matrix.flags.writeable = False
-        return Constants(self.link_lengths, cosine, sine, self.flywheel_inertias,
-                         float(masses.sum()))
+    def _match_lengths(self) -> None:
+        missing = CHANGE_POINTS @ self.link_lengths
+        relative = np.abs(missing) / self.link_lengths.mean()
+        missing[(relative < ROUNDING) | (relative >= MATCHING)] = 0.0
+        matched = self.link_lengths - missing / 4.0 @ CHANGE_POINTS
+        matched.flags.writeable = False
+        object.__setattr__(self, 'link_lengths', matched)
+
+    def _check_joints(self) -> None:
+        rigid = np.isinf(self.joint_stiffness)
+        if rigid.any() and not rigid.all():
+            raise MechanismError(
+                f'joint_stiffness of joint {int(np.argmax(rigid)) + 1} is infinite and that of '
+                f'joint {int(np.argmin(rigid)) + 1} is not: give all four, or none')
+        if rigid.all() and self.joint_damping.any():
+            raise MechanismError(
+                f'joint_damping of joint {int(np.argmax(self.joint_damping)) + 1} is given, but '
+                'the joints are rigid: give joint_stiffness too')
+
+    def _check_windings(self) -> None:
+        for wheel, name in enumerate(LINK_NAMES):
+            constant, resistance, voltage = (float(given[wheel]) for given in (
+                self.motor_torque_constants, self.motor_resistances, self.motor_voltages))
+            if np.isinf(constant) and (resistance > 0.0 or np.isfinite(voltage)):
+                raise MechanismError(
+                    f'motor_resistances or motor_voltages of {name} is given: give '
+                    'motor_torque_constants too')
+            if np.isfinite(voltage) and resistance == 0.0:
+                raise MechanismError(
+                    f'motor_voltages of {name} is given: give motor_resistances too')
+
+    def with_rigid_joints(self) -> Mechanism:
+        """Return the same linkage without compliance."""
+        return replace(
+            self, joint_stiffness=np.full(4, np.inf), joint_damping=np.zeros(4))
 
     @cached_property
-    def constants_with_locked_wheels(self) -> Constants:
-        """Work out the constants of a linkage whose wheels turn with their links."""
-        free = self.constants
-        cosine = free.cosine + np.diag(self.flywheel_inertias)
-        cosine.flags.writeable = False
-        return free._replace(cosine=cosine)
+    def constants(self) -> Constants:
+        """Work out what the kernels need, all wheels being driven by torques."""
+        return self.constants_with(np.zeros(4, dtype=bool))
+
+    def constants_with(self, prescribed: Array) -> Constants:
+        """
+        Work out the same where the motion of some wheels is prescribed instead.
+
+        :param prescribed: (4,) bool, the wheels whose angle relative to the link is given.
+        """
+        return constants_of(self, np.asarray(prescribed, dtype=bool))
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], origin: str) -> Mechanism:
@@ -132,9 +177,9 @@ class Mechanism:
         :param origin: where the values come from, for messages.
         :raises MechanismError: a key is missing or unknown, or a value is refused.
         """
-        motor = {item.name for item in fields(cls) if item.name.startswith('motor_')}
-        rest = {item.name for item in fields(cls)} - motor
-        check_keys(values, rest, origin, MechanismError, optional=motor)
+        names = {item.name for item in fields(cls)}
+        optional = {name for name in names if name.startswith(('motor_', 'joint_'))}
+        check_keys(values, names - optional, origin, MechanismError, optional=optional)
         try:
             return cls(**values)
         except MechanismError as error:
@@ -173,12 +218,15 @@ def _checked_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array
     array = numbers(name, value, MechanismError)
     if array.shape != shape:
         raise MechanismError(f'{name} must have shape {shape}, got {array.shape}')
-    unlimited = name.startswith('motor_')
+    lowest = LOWEST.get(name)
+    unlimited = name.startswith(('motor_', 'joint_')) and lowest is None
     for index, number in np.ndenumerate(array):
-        link = LINK_NAMES[index[0]]
+        place = f'joint {index[0] + 1}' if name.startswith('joint_') else LINK_NAMES[index[0]]
         if np.isnan(number) or (np.isinf(number) and not (unlimited and number > 0)):
-            raise MechanismError(f'{name} of {link} must be finite, got {number}')
-        if name != 'com_positions' and number <= 0:
-            raise MechanismError(f'{name} of {link} must be positive, got {number:g}')
+            raise MechanismError(f'{name} of {place} must be finite, got {number}')
+        if lowest is None and number <= 0:
+            raise MechanismError(f'{name} of {place} must be positive, got {number:g}')
+        if lowest is not None and number < lowest:
+            raise MechanismError(f'{name} of {place} must not be negative, got {number:g}')
     array.flags.writeable = False
     return array

@@ -50,8 +50,7 @@ class TestbedClient:
 
     def __exit__(self, *_):
         """End ROS in this process."""
-        self.node.destroy_node()
-        self.runtime.shut_down()
+        self.runtime.shut_down(self.node)
 
     def wait(self, condition, seconds=PATIENCE, missing=None):
         """
@@ -140,9 +139,9 @@ class TestbedClient:
         self.node.destroy_client(client)
         return response.success, response.message
 
-    def arm(self, wanted):
-        """Ask the device to arm or disarm: success and message."""
-        return self.call(SetBool, 'arm', SetBool.Request(data=wanted))
+    def switch(self, service, wanted):
+        """Call a service that takes yes or no, `arm` or `sim/pause`: success and message."""
+        return self.call(SetBool, service, SetBool.Request(data=wanted))
 
     def trigger(self, service):
         """Call a service without arguments: success and message."""

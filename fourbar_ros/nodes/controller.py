@@ -26,7 +26,7 @@ from fourbar_ros.nodes.messages import (
     RareLog,
     Recently,
     RELIABLE,
-    SENSOR,
+    sensor_quality,
     stamp_of,
     status_message,
     TABLE_FRAME,
@@ -75,7 +75,7 @@ class ControllerNode(Node):
         self._status = self.create_publisher(DiagnosticStatus, 'controller_status', LATCHED)
         self._diagnostics = Diagnostics(self, '', self._collect, guard)
         self.create_subscription(
-            JointState, 'flywheel_states', guard(self._on_wheels), SENSOR)
+            JointState, 'flywheel_states', guard(self._on_wheels), sensor_quality(self))
         self.create_subscription(
             JointState, 'estimate/link_states', guard(self._on_estimate), RELIABLE)
         self.create_subscription(

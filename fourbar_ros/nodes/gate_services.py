@@ -14,7 +14,7 @@
 
 """The arming gate of a testbed as services, and the topic that stops it."""
 
-from fourbar_ros.nodes.messages import RELIABLE, steady_ns
+from fourbar_ros.nodes.messages import RELIABLE
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
@@ -26,12 +26,14 @@ class GateServices:
     """
     Let people arm, disarm, stop and reset.
 
+    :param now_ns: reads the clock of the testbed's watchdogs [ns].
     :param announce: called after every change.
     """
 
-    def __init__(self, node, testbed, guard, announce):
+    def __init__(self, node, testbed, guard, now_ns, announce):
         self._node = node
         self._testbed = testbed
+        self._now_ns = now_ns
         self._announce = announce
         node.create_service(SetBool, 'arm', guard(self._on_arm))
         node.create_service(Trigger, 'emergency_stop', guard(self._on_stop))
@@ -42,7 +44,7 @@ class GateServices:
     def _on_arm(self, request, response):
         if request.data:
             response.success, response.message = self._testbed.arm(
-                steady_ns(), self._obstacles())
+                self._now_ns(), self._obstacles())
         else:
             self._testbed.disarm('disarmed on request')
             response.success = True

@@ -25,6 +25,7 @@ from sensor_msgs.msg import JointState
 # Best-effort publishers are invisible to default subscribers, so everything is offered reliable.
 RELIABLE = QoSProfile(depth=10)
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+SENSOR_IN_SIMULATED_TIME = QoSProfile(depth=5)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 TABLE_FRAME = 'table'
@@ -46,6 +47,16 @@ def steady_ns():
     would slowly slide past it.
     """
     return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
+
+
+def sensor_quality(node):
+    """
+    Choose how to subscribe to sensor data: the newest counts, except where time waits for it.
+
+    A lock-step stands still when a sample is lost, so with use_sim_time none may be.
+    """
+    simulated = node.get_parameter('use_sim_time').value
+    return SENSOR_IN_SIMULATED_TIME if simulated else SENSOR
 
 
 def stamp_of(message):

@@ -51,6 +51,8 @@ class Parameter:
         :raises ParameterError: wrong type, out of range, not one of the choices.
         """
         kind = type(self.default)
+        if kind is str and value is False:
+            value = 'off'   # which is how YAML reads that word
         if kind is float and type(value) is int:
             value = float(value)
         if type(value) is not kind:
@@ -72,7 +74,8 @@ def declare(node, table, changed=None):
     """
     Declare a table of parameters and read their first values.
 
-    :param changed: called with the dict of all values after a change at run time.
+    :param changed: called with the dict of all values before they change at run time; what it
+        raises refuses the change.
     :returns: dict of values by name.
     :raises ParameterError: a value given at start is refused.
     """
@@ -93,9 +96,12 @@ def declare(node, table, changed=None):
                 except ParameterError as error:
                     return SetParametersResult(successful=False, reason=str(error))
         if new != values:
+            try:
+                if changed is not None:
+                    changed(new)
+            except FourbarError as error:
+                return SetParametersResult(successful=False, reason=str(error))
             values.update(new)
-            if changed is not None:
-                changed(values)
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(on_set)

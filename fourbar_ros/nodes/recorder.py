@@ -60,7 +60,7 @@ class Recorder(Node):
         self.writer = writer
         self.counts = {}
         self.failure = None
-        self._publishers = {}
+        self._publisher_counts = {}
         self._skipped = set()
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time can stand still
@@ -73,9 +73,9 @@ class Recorder(Node):
                 continue
             if topic not in self.counts:
                 self._subscribe(topic, types[0])
-            elif publishers > self._publishers[topic]:
+            elif publishers > self._publisher_counts[topic]:
                 self._check_late_publisher(topic)
-            self._publishers[topic] = publishers
+            self._publisher_counts[topic] = publishers
 
     def _is_wanted(self, topic):
         unwanted = topic in self.excluded or topic_or_service_is_hidden(topic)
@@ -151,7 +151,7 @@ def record(directory, topics=(), *, exclude_internal=False, ros_args=(), live=Fa
     :raises RecorderError: it cannot start, or cannot write.
     """
     step_back()
-    runtime = Runtime(['--ros-args', *ros_args])
+    runtime, node = Runtime(['--ros-args', *ros_args]), None
     try:
         writer = Writer(directory, version=9, storage_plugin=StoragePlugin.MCAP)
         node = Recorder(writer, topics, exclude_internal)
@@ -164,7 +164,7 @@ def record(directory, topics=(), *, exclude_internal=False, ros_args=(), live=Fa
     except (WriterError, OSError) as error:
         raise RecorderError(f'cannot write {directory}: {error}') from error
     finally:
-        runtime.shut_down()
+        runtime.shut_down(node)
     if node.failure:
         raise RecorderError(node.failure)
     return node.counts

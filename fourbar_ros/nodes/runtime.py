@@ -19,9 +19,12 @@ from contextlib import suppress
 import gc
 import os
 import signal
+import time
 
+from fourbar_ros.mechanism.compiled import announced
 from fourbar_ros.nodes.environment import RosError
 import rclpy
+from rclpy.duration import Duration
 from rclpy.exceptions import (
     InvalidNamespaceException,
     InvalidNodeNameException,
@@ -34,6 +37,9 @@ from rclpy.utilities import remove_ros_args
 
 # The executor of these wheels hangs in any wait without a time limit [s].
 SPIN_TIMEOUT = 0.2
+
+# How long a node that ends waits for others to take what it said last [s].
+LAST_WORDS = 0.5
 
 
 class Runtime:
@@ -83,8 +89,16 @@ class Runtime:
         if self.failure is not None:
             raise self.failure
 
-    def shut_down(self):
-        """End ROS in this process."""
+    def shut_down(self, node=None):
+        """
+        End ROS in this process, and a node first.
+
+        The executor before it, which holds what the node is made of: a participant of Fast DDS
+        that is left to the end of the process may wait there for its own callbacks, for ever.
+        """
+        self.executor.shutdown()
+        if node is not None:
+            node.destroy_node()
         rclpy.try_shutdown()
 
 
@@ -111,7 +125,9 @@ def run_node(make_node, name, description, argv):
     runtime = Runtime(argv, real_time=True)
     node = None
     try:
-        node = make_node(runtime)
+        # Every kernel is compiled while the node is made, none while it runs.
+        with announced():
+            node = make_node(runtime)
         runtime.executor.add_node(node)
         runtime.spin()
     except (InvalidNamespaceException, InvalidNodeNameException, InvalidTopicNameException,
@@ -120,8 +136,8 @@ def run_node(make_node, name, description, argv):
     finally:
         if node is not None:
             node.close()
-            node.destroy_node()
-        runtime.shut_down()
+            _deliver(node)
+        runtime.shut_down(node)
     return 0
 
 
@@ -141,6 +157,17 @@ def go_first():
 def step_back():
     """Let those who work go first: for processes that only watch, on a machine with few cores."""
     os.nice(5)
+
+
+def _deliver(node):
+    """
+    Wait until every reliable subscriber has what was published, the last zero torque above all.
+
+    What is still under way when its publisher ends is lost.
+    """
+    end = time.monotonic() + LAST_WORDS
+    for publisher in node.publishers:
+        publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
 
 
 def _first_line(error):

@@ -55,7 +55,8 @@ def markdown_text():
                 allowed = ', '.join(f'`{choice}`' for choice in row.choices)
             elif row.limits is not None:
                 allowed = f'{row.limits[0]:g} to {row.limits[1]:g}'
-            lines.append(f'| `{row.name}` | `{row.default}` | {row.unit} | {allowed} | '
+            default = '' if row.default == '' else f'`{row.default}`'
+            lines.append(f'| `{row.name}` | {default} | {row.unit} | {allowed} | '
                          f'{"yes" if row.live else "no"} | {row.meaning} |')
         lines.append('')
     return '\n'.join(lines)
@@ -64,6 +65,8 @@ def markdown_text():
 def _scalar(value):
     if isinstance(value, str):
         return f"'{value}'"
+    if isinstance(value, bool):
+        return str(value).lower()
     # YAML 1.1 takes 1e-07 for a string: a float needs its point.
     text = repr(value)
     if 'e' in text and '.' not in text:

@@ -15,31 +15,52 @@
 """
 The simulated testbed: linkage, flywheel motors and sensors, advanced in fixed small steps.
 
-Motor torques are held over each control period (zero-order hold); within it the motor limits act
-at every step.
+Commands are held over each control period (zero-order hold); motors, bearings and the edge of the
+table act at every step.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
+from math import isfinite, sin
 
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import assemble, LINK_NAMES, Mechanism
-from fourbar_ros.mechanism.angles import wrap_angles
-from fourbar_ros.mechanism.compiled import kernel
-from fourbar_ros.mechanism.dynamics import gamma_matrix
-from fourbar_ros.mechanism.motion import (
-    advance_state,
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.dynamics import gamma_matrix, mass_matrix
+from fourbar_ros.mechanism.forces import surroundings
+from fourbar_ros.mechanism.layout import (
+    CENTRE_POSITION,
+    CENTRE_VELOCITY,
     LINK_ANGLES,
     LINK_RATES,
-    STATE_SIZE,
+    make_state,
     WHEEL_ANGLES,
     WHEEL_SPEEDS,
 )
-from fourbar_ros.mechanism.parameters import Array, Constants
+from fourbar_ros.plant.edge import joint_levers, joint_motion
+from fourbar_ros.plant.ledger import balance, CONTACTS, Ledger, nothing_added
+from fourbar_ros.plant.motion import (
+    advance_plant,
+    Boxed,
+    MOTOR_STATE_SIZE,
+    SOUND,
+)
+from fourbar_ros.plant.motors import motors_of
+from fourbar_ros.plant.sensors import LinkSensors
 from fourbar_ros.plant.table import quantum, Table
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+# Standard gravity [m/s^2].
+GRAVITY = 9.80665
+
+# What dry friction in a joint makes of a rate must be slower than a step can follow (its real
+# limit for Runge-Kutta of order four is 2.8, here with a margin for other poses).
+STIFFEST = 1.0
+
+# Relative rates in joints 1 to 4, from the rates of the links.
+RELATIVE = np.array([[-1, 1, 0, 0], [0, -1, 1, 0], [0, 0, -1, 1], [1, 0, 0, -1]], dtype=float)
 
 
 class PlantError(FourbarError):
@@ -72,7 +93,11 @@ class Truth:
     :param link_rates: (4,) [rad/s].
     :param wheel_angles: (4,) relative to the link, unwrapped [rad].
     :param wheel_speeds: (4,) relative to the link [rad/s].
-    :param efforts: (4,) torque on each wheel, mean over the last control period [N m].
+    :param efforts: (4,) torque of each motor, mean over the last control period [N m].
+    :param centre_position: (2,) of the mass centre of the whole, in frame `table` [m].
+    :param centre_velocity: (2,) [m/s].
+    :param base_position: (2,) of joint 1, the origin of the frame of link a [m].
+    :param base_velocity: (2,) [m/s].
     """
 
     link_angles: Array
@@ -80,6 +105,10 @@ class Truth:
     wheel_angles: Array
     wheel_speeds: Array
     efforts: Array
+    centre_position: Array
+    centre_velocity: Array
+    base_position: Array
+    base_velocity: Array
 
 
 class Plant:
@@ -91,7 +120,9 @@ class Plant:
     :param initial: where it starts.
     :param step_s: integration step [s].
     :param generator: source of all randomness.
-    :raises PlantError: the step is not a positive number.
+    :ivar link_sensors: with the samples on their way.
+    :ivar efforts: (4,) mean torque of each motor since the last call of `advance` [N m].
+    :raises PlantError: the step is not a positive number, or too long for the friction.
     :raises ClosureError: the loop cannot close at the initial angles, or unknown branch.
     """
 
@@ -103,12 +134,73 @@ class Plant:
         self.step_s = step_s
         self._table = table
         self._generator = generator
-        self._state = _initial_state(mechanism, initial)
-        self._efforts = np.zeros(4)
-        self._scratch = np.empty((6, STATE_SIZE))
+        # Of seeds of their own, so that no sensor shifts the random numbers of the table.
+        self.link_sensors = LinkSensors(
+            table.link_sensors, np.random.SeedSequence(generator.integers(2**63)))
+        surface = table.surface
+        self._half_sizes = 0.5 * np.array([surface.size_x, surface.size_y])
+        # Arrays of one, see Boxed.
+        self._constants = np.array([mechanism.constants])
+        self._motors = np.array([motors_of(mechanism, table.wheel_bearings)])
+        self._around = np.array([surroundings(
+            joint_coulomb=table.joints.coulomb, joint_viscous=table.joints.viscous,
+            joint_static_ratio=table.joints.static_ratio,
+            stribeck_rate=table.joints.stribeck_rate, smoothing=table.joints.smoothing,
+            link_drag=table.links.drag, link_spin_drag=table.links.spin_drag,
+            gravity=GRAVITY * np.array([sin(surface.tilt_x), sin(surface.tilt_y)]))])
+        self._around['acting'] |= table.disturbance.torque_density > 0.0
+        self.efforts = np.zeros(4)
+        self.reset(initial)
+        self._check_friction()
         # Compile the kernels now, not while time runs.
-        self.advance(1, np.zeros(4))
-        self._state = _initial_state(mechanism, initial)
+        self._advance(np.zeros((1, 4)), np.zeros(4, dtype=bool), SOUND)
+        self.reset(initial)
+
+    def _check_friction(self) -> None:
+        joints = self._table.joints
+        slope = joints.viscous + joints.coulomb * joints.static_ratio / joints.smoothing
+        matrix = mass_matrix(self._state[LINK_ANGLES], self.mechanism.constants)
+        rates = np.linalg.eigvals(np.linalg.solve(matrix, slope * RELATIVE.T @ RELATIVE))
+        fastest = float(np.abs(rates).max())
+        if fastest * self.step_s > STIFFEST:
+            raise PlantError(
+                f'a step of {self.step_s:g} s is too long for the friction in the joints of this '
+                f'linkage, at most {STIFFEST / fastest:.2g} s: take a shorter step, less '
+                'joints.coulomb, or more joints.smoothing')
+        links = self._table.links
+        slowing = max(links.drag / self.mechanism.link_masses.min(),
+                      links.spin_drag / self.mechanism.link_inertias.min())
+        if slowing * self.step_s > STIFFEST:
+            raise PlantError(
+                f'a step of {self.step_s:g} s is too long for the drag on these links, at most '
+                f'{STIFFEST / slowing:.2g} s: take a shorter step, less links.drag or '
+                'links.spin_drag')
+
+    def reset(self, initial: InitialState) -> None:
+        """
+        Put the linkage somewhere, at once, motors without torque; random numbers go on.
+
+        :raises PlantError, ClosureError: it cannot be there; then nothing was changed.
+        """
+        state = _initial_state(self.mechanism, initial)
+        self._check_place(state)
+        self._state = state
+        self._start = self._state.copy()
+        self.link_sensors.reset()
+        self._motor_state = np.zeros(MOTOR_STATE_SIZE)
+        self._motor_state[4:] = np.nan     # no wheel follows a speed yet
+        self._added = nothing_added()
+        self.efforts[:] = 0.0
+
+    def _check_place(self, state: Array) -> None:
+        lever = np.empty((4, 2))
+        for joint in range(4):
+            joint_levers(joint, state, self.mechanism.constants, lever)
+            beyond = np.abs(state[CENTRE_POSITION] + lever.sum(axis=0)) - self._half_sizes
+            if beyond.max() > 0.0:
+                raise PlantError(
+                    f'joint {joint + 1} would start {beyond.max():.3g} m beyond the edge of the '
+                    'table: take a larger surface.size_x and size_y')
 
     def steps_in(self, duration_s: float) -> int:
         """
@@ -123,32 +215,72 @@ class Plant:
                 f'{duration_s:g} s / {self.step_s:g} s = {duration_s / self.step_s:g}')
         return steps
 
-    def advance(self, steps: int, torques: Array) -> None:
+    def disturb(self, duration_s: float) -> None:
         """
-        Move on by a number of steps under constant motor commands.
+        Draw the random torques on the links anew.
 
-        :param torques: (4,) motor torques asked for [N m].
+        :param duration_s: for how long they are going to be held [s].
+        """
+        density = self._table.disturbance.torque_density
+        if density:
+            self._around['link_torques'][0] = self._generator.standard_normal(4) * (
+                density / np.sqrt(duration_s))
+
+    def advance(self, steps: int, commands: Array, by_speed: ArrayLike = False,
+                conditions: Boxed = SOUND) -> None:
+        """
+        Move on by a number of steps.
+
+        :param commands: (4,) torques asked of the motors [N m], or speeds of the wheels relative
+            to the links [rad/s]; or (steps, 4) of them, one for each step.
+        :param by_speed: which of both, (4,) or the same for all wheels.
+        :param conditions: what is wrong with the wheels.
         :raises PlantError: the state is no longer finite.
         """
-        advance_plant(
-            self._state, torques, self.mechanism.motor_torque_limits,
-            self.mechanism.motor_speed_limits, self.step_s, steps, self.mechanism.constants,
-            self._scratch, self._efforts)
+        followed = np.zeros(4, dtype=bool)
+        followed[:] = by_speed
+        self._motor_state[4:][~followed] = np.nan
+        held = np.empty((steps, 4))
+        held[:] = commands
+        self._advance(held, followed, conditions)
         if not np.isfinite(self._state).all():
             raise PlantError('the state of the plant is no longer finite')
 
-    def truth(self) -> Truth:
-        """Return a copy of the true state."""
-        state = self._state
-        return Truth(
-            state[LINK_ANGLES].copy(), state[LINK_RATES].copy(), state[WHEEL_ANGLES].copy(),
-            state[WHEEL_SPEEDS] - state[LINK_RATES], self._efforts.copy())
+    def _advance(self, commands: Array, by_speed: NDArray[np.bool_],
+                 conditions: Boxed) -> None:
+        surface = self._table.surface
+        advance_plant(
+            self._state, self._motor_state, commands, by_speed, self.step_s, self._constants,
+            self._around, self._motors, conditions,
+            self._half_sizes, float(surface.restitution), self.efforts, self._added)
 
-    def sense_links(self) -> Array:
-        """Sample the four link sensors: (4,) orientations in (-pi, pi] [rad]."""
-        sensors = self._table.link_sensors
-        angles = self._state[LINK_ANGLES] + sensors.noise_rms * self._generator.standard_normal(4)
-        return wrap_angles(quantise(angles, quantum(sensors.counts_per_turn)))
+    def truth(self, efforts: Array | None = None) -> Truth:
+        """
+        Return a copy of the true state.
+
+        :param efforts: (4,) to tell instead of those since the last call of `advance` [N m].
+        """
+        state = self._state.copy()
+        base = np.array(joint_motion(0, state, self._constants))
+        return Truth(
+            state[LINK_ANGLES], state[LINK_RATES], state[WHEEL_ANGLES],
+            state[WHEEL_SPEEDS] - state[LINK_RATES],
+            self.efforts.copy() if efforts is None else efforts,
+            state[CENTRE_POSITION], state[CENTRE_VELOCITY], base[:2], base[2:])
+
+    @property
+    def contacts(self) -> int:
+        """How often a joint met the edge of the table since the start or the last reset."""
+        return int(self._added[CONTACTS])
+
+    def ledger(self) -> Ledger:
+        """Draw up the accounts of energy and momentum since the start or the last reset."""
+        return balance(self.mechanism, self._state, self._start, self._added)
+
+    def measure_links(self, stamp_ns: int) -> None:
+        """Let the link sensors take a sample now, if one is due [ns]."""
+        self.link_sensors.measure(
+            stamp_ns, self._state[LINK_ANGLES], self._state[LINK_RATES])
 
     def sense_wheels(self) -> Array:
         """Read the four wheel encoders: (4,) unwrapped angles relative to the link [rad]."""
@@ -159,36 +291,6 @@ class Plant:
 def quantise(angles: Array, step: float) -> Array:
     """Round angles [rad] to multiples of a step [rad]; a step of 0 leaves them as they are."""
     return np.round(angles / step) * step if step else np.array(angles)
-
-
-@kernel
-def advance_plant(
-    state: Array, commands: Array, torque_limits: Array, speed_limits: Array, step: float,
-    steps: int, constants: Constants, scratch: Array, efforts: Array,
-) -> None:
-    """
-    Advance the plant under constant motor commands, in place.
-
-    A motor gives no torque beyond its limit, and none that would drive its wheel further where
-    the wheel already is at the speed limit (relative to the link).
-
-    :param state: (16,), see mechanism.motion.
-    :param commands: (4,) [N m].
-    :param torque_limits, speed_limits: (4,) [N m], [rad/s].
-    :param scratch: (6, 16) work space.
-    :param efforts: (4,) receives the mean of the torques really applied [N m].
-    """
-    torques = np.empty(4)
-    efforts[:] = 0.0
-    for _ in range(steps):
-        for j in range(4):
-            torque = min(max(commands[j], -torque_limits[j]), torque_limits[j])
-            speed = state[12 + j] - state[4 + j]
-            if abs(speed) >= speed_limits[j] and torque * speed > 0.0:
-                torque = 0.0
-            torques[j] = torque
-            efforts[j] += torque / steps
-        advance_state(state, torques, torques, torques, step, constants, scratch)
 
 
 def _initial_state(mechanism: Mechanism, initial: InitialState) -> Array:
@@ -203,8 +305,4 @@ def _initial_state(mechanism: Mechanism, initial: InitialState) -> Array:
                 f'initial rates are given at a change point ({LINK_NAMES[2]} and {LINK_NAMES[3]} '
                 'on a line), where they do not determine the motion')
         rates[2:] = gamma_matrix(angles, mechanism.constants.lengths) @ rates[:2]
-    state = np.zeros(STATE_SIZE)
-    state[LINK_ANGLES] = angles
-    state[LINK_RATES] = rates
-    state[WHEEL_SPEEDS] = rates
-    return state
+    return make_state(angles, rates)

@@ -78,10 +78,10 @@ def both(module_suite, tmp_path_factory):
     first = module_suite.start('demo', '--output', str(output))
     wait_for(lambda: first.popen.poll() is not None or 'Turning' in first.stdout)
     assert first.popen.poll() is None, first.stderr
+    started = children(first)
     rival_output = output.parent / 'rival'
     rival = module_suite.start('demo', '--output', str(rival_output))
     rival.end(seconds=60.0)
-    started = children(first)
     first.end(seconds=DEMO_S)
     return {'first': first, 'rival': rival, 'output': output, 'rival_output': rival_output,
             'children': started}

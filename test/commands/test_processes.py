@@ -196,3 +196,22 @@ def test_children_end_with_a_parent_that_is_killed(stage: Stage) -> None:
         assert time.monotonic() < end
         time.sleep(0.02)
     assert sorted(stage.events()[2:]) == [('one', 'SIGTERM'), ('two', 'SIGTERM')]
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason='Python does not offer it')
+def test_package_in_the_folder_where_one_stands_is_not_what_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A checkout of the package, another one than this."""
+    other = tmp_path / 'fourbar_ros'
+    other.mkdir()
+    (other / '__init__.py').touch()
+    (other / '__main__.py').write_text("print('another package', flush=True)")
+    monkeypatch.chdir(tmp_path)
+    with Processes(tmp_path, os.environ) as children:
+        children.start('--version')
+        end = time.monotonic() + PATIENCE
+        while not (said := (tmp_path / '--version.log').read_text()):
+            assert time.monotonic() < end
+            time.sleep(0.05)
+    assert said.startswith('fourbar_ros ')

@@ -15,6 +15,7 @@
 """`fourbar simulate` reproduces the reference motions, and says in one line what is wrong."""
 
 from collections.abc import Callable
+from dataclasses import replace
 import json
 from pathlib import Path
 import re
@@ -23,11 +24,13 @@ import sys
 from typing import Any
 
 from fourbar_ros.commands.main import main
+from fourbar_ros.configuration import share_directory
+from fourbar_ros.loop import load_scenario, record_run
 from fourbar_ros.mechanism.case import load_case, simulate
 import numpy as np
 import pytest
 
-CASES = sorted((Path(__file__).parents[1] / 'data').glob('*.json'))
+CASES = sorted((Path(__file__).parents[2] / 'config' / 'reference').glob('*.json'))
 HEADER = ('t,link_a,link_b,link_c,link_d,rate_a,rate_b,rate_c,rate_d,'
           'flywheel_a,flywheel_b,flywheel_c,flywheel_d')
 # What the command promises; the references themselves hold 1e-10.
@@ -51,7 +54,7 @@ def test_reference_motion_is_reproduced(
 ) -> None:
     output = tmp_path / 'out.csv'
     assert main(['simulate', str(case), '-o', str(output)]) == 0
-    assert capsys.readouterr() == ('', '')
+    assert capsys.readouterr().out == 'branch: open from t = 0 s\n'
     reference = json.loads(case.read_text())
     header, table = read(output)
     assert header == HEADER
@@ -79,7 +82,7 @@ def test_command_runs_as_a_process(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, '-m', 'fourbar_ros', 'simulate', str(CASES[0]), '-o', str(output)],
         capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+    assert (done.returncode, done.stdout) == (0, 'branch: open from t = 0 s\n')
     assert len(read(output)[1]) == len(json.loads(CASES[0].read_text())['t'])
 
 
@@ -258,3 +261,62 @@ def test_motion_that_leaves_the_finite_numbers(
 ) -> None:
     assert 'no longer finite' in refused(
         changed(good, 'motor_torque.amplitude', [1e300, -1e300, 1e300, 0.0]))
+
+
+# The closed loop
+
+def closed_loop(output: Path, *arguments: str) -> bytes:
+    """Run a second of the paper's scenario in a process of its own, and return the table."""
+    done = subprocess.run(
+        [sys.executable, '-m', 'fourbar_ros', 'simulate', '--closed-loop', 'paper', '--duration',
+         '1', '-o', str(output), *arguments], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, '')
+    return output.read_bytes()
+
+
+def test_same_seed_gives_the_same_bytes_in_another_process(tmp_path: Path) -> None:
+    first = closed_loop(tmp_path / '1.csv')
+    assert first == closed_loop(tmp_path / '2.csv')
+    assert first == closed_loop(tmp_path / '3.csv', '--seed', '0')
+    assert first != closed_loop(tmp_path / '4.csv', '--seed', '1')
+
+
+def test_closed_loop_table_is_the_recorded_run(tmp_path: Path) -> None:
+    output = tmp_path / 'out.csv'
+    assert main(['simulate', '--closed-loop', 'prototype', '--duration', '0.5', '-o',
+                 str(output)]) == 0
+    scenario = replace(load_scenario('prototype'), duration=0.5)
+    assert output.read_text() == ''.join(record_run(scenario).lines())
+
+
+@pytest.mark.parametrize(('arguments', 'told'), [
+    ([], 'either CASE.json or --closed-loop'),
+    (['case.json', '--closed-loop', 'paper'], 'either CASE.json or --closed-loop'),
+    (['case.json', '--seed', '1'], '--seed goes with --closed-loop'),
+    (['case.json', '--duration', '1'], '--duration goes with --closed-loop'),
+    (['--closed-loop', 'paper', '--step', '0.001'], 'plant.step'),
+    (['--closed-loop', 'papre'], "no scenario 'papre'"),
+    (['--closed-loop', './none.yaml'], 'none.yaml'),
+    (['--closed-loop', 'paper', '--seed', '-1'], 'seed must be'),
+    (['--closed-loop', 'paper', '--duration', '0'], 'duration must be'),
+    (['--closed-loop', 'paper', '--duration', 'nan'], 'duration must be'),
+    (['--closed-loop', './odd.yaml'], 'whole multiple'),
+    (['--closed-loop', './late.yaml'], 'setpoints, entry 1 at 0.5 s, refused'),
+])
+def test_impossible_closed_loop(
+    arguments: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """One line, and no file, not even where the run ends in its middle."""
+    monkeypatch.chdir(tmp_path)
+    text = (share_directory() / 'config' / 'scenario_paper.yaml').read_text()
+    Path('odd.yaml').write_text(text.replace('step: 5.0e-4', 'step: 3.0e-4'))
+    Path('late.yaml').write_text(re.sub(
+        r'at: 0.4 .*\n.*\n', 'at: 0.5\n    links: {link_a: 0.0, link_c: 1.0}\n', text))
+    before = sorted(tmp_path.iterdir())
+    assert main(['simulate', *arguments, '-o', 'out.csv']) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ''
+    assert len(printed.err.splitlines()) == 1
+    assert told in printed.err
+    assert sorted(tmp_path.iterdir()) == before

@@ -21,7 +21,8 @@ from fourbar_ros.control.allocation import minimum_norm
 from fourbar_ros.control.reference import SoftStep
 from fourbar_ros.mechanism import assemble, Mechanism, reduced_form
 from fourbar_ros.plant import InitialState, Plant, Table
-from fourbar_ros.plant.table import LinkSensors, WheelEncoders
+from fourbar_ros.plant.sensors import LinkSensorSettings
+from fourbar_ros.plant.table import WheelEncoders
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -71,7 +72,7 @@ def test_any_other_answer_accelerates_the_wheels_more(seed: int, draw: Draw) -> 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_null_space_only_loads_the_joints(seed: int, draw: Draw, uneven: Mechanism) -> None:
     """Torques with G tau = 0 turn the wheels, and no link moves, in the plant itself."""
-    plant = Plant(uneven, Table(LinkSensors(0.0, 0), WheelEncoders(0)),
+    plant = Plant(uneven, Table(LinkSensorSettings(), WheelEncoders(0)),
                   InitialState(0.1 * seed, 0.1 * seed + 1.2), 5e-4, np.random.default_rng(0))
     angles = plant.truth().link_angles
     free = null_space(reduced_form(uneven, angles, np.zeros(2)).wheel_map)

@@ -20,7 +20,7 @@ from collections.abc import Callable
 
 from fourbar_ros.device import (
     ArmingGate,
-    LinkSample,
+    Drive,
     Samples,
     Testbed,
     TestbedSettings,
@@ -28,7 +28,8 @@ from fourbar_ros.device import (
     WheelSample,
 )
 from fourbar_ros.errors import FourbarError
-from fourbar_ros.mechanism import load_mechanism, Mechanism
+from fourbar_ros.mechanism import LINK_NAMES, load_mechanism, Mechanism
+from fourbar_ros.plant import SensorReading
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -41,7 +42,7 @@ class Bench:
     """
     A device that does what it is told.
 
-    :ivar driven: torques of every step.
+    :ivar driven: torques of every step; speeds are followed in proportion, within the limits.
     :ivar gate: set by whoever wants to know its state (and reason) at the last step.
     :ivar gate_then: that state and reason.
     :ivar links: the links that give a sample.
@@ -49,6 +50,8 @@ class Bench:
     """
 
     description = 'bench'
+    sensor_names = LINK_NAMES
+    measures_rates = False
 
     def __init__(self, mechanism: Mechanism) -> None:
         self.mechanism = mechanism
@@ -60,14 +63,22 @@ class Bench:
         self.gate_then = (self.gate.state, '')
         self.speeds = np.array([10.0, -20.0, 0.0, 5.0])
 
-    def step(self, stamp_ns: int, torques: Array) -> Samples:
+    def diagnosis(self) -> dict[str, str]:
+        """Nothing is ever wrong with a bench."""
+        return {}
+
+    def step(self, stamp_ns: int, drive: Drive) -> Samples:
         """Take down the torques and let the wheels follow them."""
-        self.driven.append(np.array(torques))
+        inertias, limits = self.mechanism.flywheel_inertias, self.mechanism.motor_torque_limits
+        following = np.clip(30.0 * inertias * (drive.values - self.speeds), -limits, limits)
+        torques = np.where(drive.by_speed, following, drive.values)
+        self.driven.append(torques)
         self.gate_then = (self.gate.state, self.gate.reason)
         if self.breaks:
             raise FourbarError('the bus is off')
         self.speeds = self.speeds + torques / self.mechanism.flywheel_inertias * 4e-3
-        sample = LinkSample(stamp_ns, self.links, np.zeros(len(self.links)))
+        names = tuple(LINK_NAMES[link] for link in self.links)
+        sample = SensorReading(stamp_ns, names, np.zeros(len(names)), np.empty(0))
         return Samples(stamp_ns, (sample,), WheelSample(np.zeros(4), self.speeds, torques))
 
 

@@ -17,7 +17,7 @@
 from itertools import permutations
 from math import inf, nan
 
-from fourbar_ros.device.command import torques_by_name
+from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.mechanism import FLYWHEEL_NAMES
 from fourbar_ros.mechanism.by_name import RejectedError
 from hypothesis import given, settings
@@ -30,23 +30,34 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
 
 def rejected(names: list[str], efforts: list[float], **others: list[float]) -> RejectedError:
     with pytest.raises(RejectedError) as caught:
-        torques_by_name(
+        drive_by_name(
             names, others.get('positions', []), others.get('velocities', []), efforts)
     return caught.value
 
 
 @pytest.mark.parametrize('order', list(permutations(range(4))))
 def test_names_may_come_in_any_order(order: tuple[int, ...]) -> None:
-    torques = torques_by_name(
-        [FLYWHEEL_NAMES[wheel] for wheel in order], [], [], [10.0 + wheel for wheel in order])
-    assert torques.tolist() == [10.0, 11.0, 12.0, 13.0]
+    names, values = [FLYWHEEL_NAMES[wheel] for wheel in order], [10.0 + wheel for wheel in order]
+    for drive, by_speed in ((drive_by_name(names, [], [], values), False),
+                            (drive_by_name(names, [], values, []), True)):
+        assert drive.values.tolist() == [10.0, 11.0, 12.0, 13.0]
+        assert drive.by_speed.tolist() == [by_speed] * 4
 
 
 @settings(derandomize=True)
 @given(given_torques=st.dictionaries(st.sampled_from(FLYWHEEL_NAMES), finite, min_size=1))
 def test_wheel_that_is_not_named_gets_none(given_torques: dict[str, float]) -> None:
-    torques = torques_by_name(list(given_torques), [], [], list(given_torques.values()))
-    assert torques.tolist() == [given_torques.get(name, 0.0) for name in FLYWHEEL_NAMES]
+    drive = drive_by_name(list(given_torques), [], [], list(given_torques.values()))
+    assert drive.values.tolist() == [given_torques.get(name, 0.0) for name in FLYWHEEL_NAMES]
+    assert not drive.by_speed.any()
+
+
+@settings(derandomize=True)
+@given(speeds=st.dictionaries(st.sampled_from(FLYWHEEL_NAMES), finite, min_size=1))
+def test_wheel_whose_speed_is_not_named_coasts(speeds: dict[str, float]) -> None:
+    drive = drive_by_name(list(speeds), [], list(speeds.values()), [])
+    assert drive.values.tolist() == [speeds.get(name, 0.0) for name in FLYWHEEL_NAMES]
+    assert drive.by_speed.tolist() == [name in speeds for name in FLYWHEEL_NAMES]
 
 
 @pytest.mark.parametrize('name', ['flywheel_e', 'link_a', '', 'Flywheel_a'])
@@ -81,7 +92,10 @@ def test_effort_must_be_finite(wheel: str, value: float) -> None:
     assert str(value) in str(error)
 
 
-@pytest.mark.parametrize('field', ['positions', 'velocities'])
-def test_only_effort_is_taken(field: str) -> None:
-    assert rejected([A], [1.0], **{field: [0.0]}).kind == 'fields'
-    assert rejected([A], [], **{field: [0.0]}).kind == 'fields'
+@pytest.mark.parametrize(('efforts', 'others'), [
+    ([1.0], {'positions': [0.0]}), ([], {'positions': [0.0]}), ([1.0], {'velocities': [0.0]}),
+    ([], {'positions': [0.0], 'velocities': [0.0]})])
+def test_effort_or_velocity_is_taken_and_nothing_else(
+    efforts: list[float], others: dict[str, list[float]],
+) -> None:
+    assert rejected([A], efforts, **others).kind == 'fields'

@@ -12,11 +12,23 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""In real time every tick comes once, on the grid, and time never goes back."""
+"""By every clock each tick comes once, on the grid, and time never goes back."""
 
-from fourbar_ros.device import RealtimePace
+from collections.abc import Callable
+from math import inf, nan
+
+from fourbar_ros.device import (
+    ClockLimit,
+    FastPace,
+    LockstepPace,
+    Pace,
+    PaceError,
+    RealtimePace,
+)
+from fourbar_ros.device.pacing import FIRST_STAMP_NS
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import pytest
 
 SYSTEM = 1_700_000_000_000_000_123
 STEADY = 987_654_321
@@ -28,7 +40,22 @@ def pace(period: int = PERIOD, patience: int = PATIENCE) -> RealtimePace:
     return RealtimePace(SYSTEM, STEADY, period, patience)
 
 
-def due(clock: RealtimePace, steady: int) -> list[int]:
+def fast(factor: float) -> FastPace:
+    return FastPace(STEADY, PERIOD, factor, PATIENCE)
+
+
+def lockstep() -> LockstepPace:
+    clock = LockstepPace(PERIOD)
+    clock.ready = True
+    return clock
+
+
+CLOCKS = {'realtime': pace, 'fast': lambda: fast(3.7), 'as fast as it can': lambda: fast(0.0),
+          'lockstep': lockstep}
+every_clock = pytest.mark.parametrize('make', CLOCKS.values(), ids=list(CLOCKS))
+
+
+def due(clock: Pace, steady: int) -> list[int]:
     """Take all ticks that are due, one by one."""
     stamps = []
     while (stamp := clock.due(steady)) is not None:
@@ -89,3 +116,125 @@ def test_grid_is_kept_whatever_the_delays(
     assert all((stamp - SYSTEM) % period == 0 for stamp in stamps)
     passed = (latest - STEADY) // period + 1 if latest >= STEADY else 0
     assert len(stamps) + clock.skipped == passed
+
+
+@every_clock
+def test_pause_freezes_time_whatever_passes(make: Callable[[], Pace]) -> None:
+    clock = make()
+    clock.due(STEADY)
+    clock.pause(STEADY + PERIOD // 2)
+    frozen = clock.now_ns(STEADY + PERIOD // 2)
+    for later in (PERIOD, 10 ** 9, 3600 * 10 ** 9):
+        assert clock.due(STEADY + later) is None
+        assert clock.now_ns(STEADY + later) == frozen
+        clock.pause(STEADY + later)
+    clock.resume(STEADY + 3600 * 10 ** 9)
+    assert clock.now_ns(STEADY + 3600 * 10 ** 9) == frozen
+
+
+@every_clock
+def test_ticks_stay_on_the_grid_through_pauses_and_steps(make: Callable[[], Pace]) -> None:
+    """Not one is left out or comes twice, and the time of the watchdogs never goes back."""
+    clock, now = make(), STEADY
+    stamps, times = [], []
+
+    def take(stamp: int | None) -> None:
+        if stamp is not None:
+            stamps.append(stamp)
+            clock.answered(stamp)
+        times.append(clock.now_ns(now))
+    for _ in range(5):
+        for _ in range(20):
+            now += PERIOD // 5
+            take(clock.due(now))
+        clock.pause(now)
+        for _ in range(3):
+            now += 7 * PATIENCE
+            take(clock.step(now))
+        now += 3 * PATIENCE
+        clock.resume(now)
+    assert len(stamps) > 20
+    assert stamps == [stamps[0] + n * PERIOD for n in range(len(stamps))]
+    assert times == sorted(times)
+    assert clock.skipped == 0
+    assert clock.ticks == len(stamps)
+
+
+@every_clock
+def test_running_clock_is_not_stepped(make: Callable[[], Pace]) -> None:
+    clock = make()
+    with pytest.raises(PaceError, match='running, pause it first'):
+        clock.step(STEADY)
+    assert clock.due(STEADY) is not None
+
+
+@pytest.mark.parametrize('factor', [0.25, 1.0, 20.0])
+def test_fast_time_passes_so_many_times_as_fast(factor: float) -> None:
+    clock = fast(factor)
+    stamps = [stamp for n in range(2001) for stamp in due(clock, STEADY + n * PERIOD // 40)]
+    elapsed = 2000 * (PERIOD // 40)
+    assert stamps == [FIRST_STAMP_NS + n * PERIOD
+                      for n in range(int(elapsed * factor) // PERIOD + 1)]
+
+
+def test_fast_time_slows_down_on_a_slow_machine_and_leaves_no_tick_out() -> None:
+    """Every tick takes twice as long as it may."""
+    clock = fast(1.0)
+    stamps = [clock.due(STEADY + n * 2 * PERIOD) for n in range(1000)]
+    assert stamps == [FIRST_STAMP_NS + n * PERIOD for n in range(1000)]
+    # The second half of the delay is not caught up with: it was given up on long ago.
+    late = STEADY + 2000 * PERIOD
+    assert len(due(clock, late)) <= PATIENCE // PERIOD + 1
+
+
+def test_fastest_time_always_has_a_tick_to_make() -> None:
+    clock = fast(0.0)
+    assert [clock.due(STEADY) for _ in range(3)] == [
+        FIRST_STAMP_NS + n * PERIOD for n in range(3)]
+    assert clock.now_ns(STEADY) == FIRST_STAMP_NS + 2 * PERIOD
+
+
+@pytest.mark.parametrize('factor', [-1.0, inf, nan])
+def test_impossible_factor_is_refused(factor: float) -> None:
+    with pytest.raises(PaceError, match='real-time factor'):
+        fast(factor)
+
+
+def test_lockstep_waits_for_the_answer_to_this_tick() -> None:
+    clock, later = lockstep(), STEADY + 10 ** 12
+    assert clock.due(STEADY) == FIRST_STAMP_NS
+    assert clock.due(later) is None
+    for stamp in (0, FIRST_STAMP_NS - PERIOD, FIRST_STAMP_NS + PERIOD):
+        assert not clock.answered(stamp)
+        assert clock.due(later) is None
+    assert clock.answered(FIRST_STAMP_NS)
+    assert not clock.answered(FIRST_STAMP_NS)
+    assert clock.due(later) == FIRST_STAMP_NS + PERIOD
+    # Whatever the clock on the wall says.
+    assert clock.now_ns(later + 10 ** 12) == FIRST_STAMP_NS + PERIOD
+
+
+def test_lockstep_makes_no_tick_for_nobody() -> None:
+    clock = LockstepPace(PERIOD)
+    assert clock.due(STEADY) is None
+    clock.pause(STEADY)
+    with pytest.raises(PaceError, match='nobody is there'):
+        clock.step(STEADY)
+
+
+def test_lockstep_takes_one_step_at_a_time() -> None:
+    clock = lockstep()
+    clock.pause(STEADY)
+    assert clock.step(STEADY) == FIRST_STAMP_NS
+    with pytest.raises(PaceError, match='1.000000000 s is not answered yet'):
+        clock.step(STEADY)
+    assert clock.answered(FIRST_STAMP_NS)
+    assert clock.due(STEADY) is None
+    assert clock.step(STEADY) == FIRST_STAMP_NS + PERIOD
+
+
+def test_clock_is_told_no_more_often_than_asked() -> None:
+    limit = ClockLimit(5_000_000)
+    told = [now for now in range(0, 1_000_000_000, 700_000) if limit.passes(now)]
+    assert min(after - before for before, after in zip(told, told[1:])) >= 5_000_000
+    assert len(told) > 150

@@ -16,15 +16,17 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import combinations
 from math import inf, nan, pi
 from typing import Any
 
 from fourbar_ros.estimation import Estimate, Estimator, EstimatorSettings
-from fourbar_ros.mechanism import assemble, LINK_NAMES, Mechanism
+from fourbar_ros.mechanism import assemble, branch_of, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.by_name import RejectedError
-from fourbar_ros.plant import InitialState, Plant, Table
-from fourbar_ros.plant.table import LinkSensors, WheelEncoders
+from fourbar_ros.plant import Fault, InitialState, Plant, Table
+from fourbar_ros.plant.sensors import LinkSensorSettings
+from fourbar_ros.plant.table import WheelEncoders
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -34,8 +36,8 @@ Array = NDArray[np.float64]
 PERIOD_NS = 4_000_000
 FIRST_NS = 1_000_000_000
 NOISE = 1.7453e-3
-REAL = Table(LinkSensors(NOISE, 16384), WheelEncoders(16384))
-PERFECT = Table(LinkSensors(0.0, 0), WheelEncoders(0))
+REAL = Table(LinkSensorSettings(noise_rms=NOISE, counts_per_turn=16384), WheelEncoders(16384))
+PERFECT = Table(LinkSensorSettings(), WheelEncoders(0))
 STILL = [0.0] * 4
 # With noise the errors stay within so many sigmas: 4000 numbers exceed 5 with p = 0.002.
 SIGMAS = 5.0
@@ -50,17 +52,21 @@ class Run:
         self.estimator = Estimator(mechanism, EstimatorSettings())
         self.stamp_ns = FIRST_NS
 
-    def tick(self, links: tuple[int, ...] = (0, 1, 2, 3), torques: Array | None = None
-             ) -> Estimate | None:
-        """Advance by a period, measure some links, and estimate."""
+    def tick(self, sensors: tuple[int, ...] | None = None, torques: Array | None = None,
+             offsets: Array | None = None) -> Estimate | None:
+        """Advance by a period, measure with some sensors or all, some off, and estimate."""
         before = self.plant.sense_wheels()
         self.plant.advance(8, np.zeros(4) if torques is None else torques)
         speeds = (self.plant.sense_wheels() - before) / 4e-3
         self.stamp_ns += PERIOD_NS
-        if links:
+        names = self.plant.link_sensors.names
+        chosen = range(len(names)) if sensors is None else sensors
+        if chosen:
+            self.plant.measure_links(self.stamp_ns)
+            reading, = self.plant.link_sensors.due(self.stamp_ns)
             self.estimator.measure(
-                self.stamp_ns, [LINK_NAMES[link] for link in links],
-                list(self.plant.sense_links()[list(links)]))
+                self.stamp_ns, [names[sensor] for sensor in chosen],
+                list((reading.angles + (0.0 if offsets is None else offsets))[list(chosen)]))
         return self.estimator.tick(self.stamp_ns, list(speeds))
 
     def ticks(self, count: int, *args: Any) -> Iterator[Estimate]:
@@ -116,6 +122,43 @@ def test_estimate_is_continuous_over_many_turns(mechanism: Mechanism, direction:
     assert np.abs(settled - 2.0 * pi * turns).max() < SIGMAS * NOISE
 
 
+def joint_encoders(heading: str) -> Table:
+    """Make a table with encoders in the joints, and one absolute sensor."""
+    return replace(REAL, link_sensors=replace(
+        REAL.link_sensors, kind='joint', heading=heading))
+
+
+@pytest.mark.parametrize('heading', LINK_NAMES)
+def test_joint_encoders_and_a_heading_do_as_well(heading: str, mechanism: Mechanism) -> None:
+    """Errors settle within their sigmas, whatever link has the absolute sensor."""
+    run = Run(mechanism, InitialState(0.3, 1.6, 'open', 0.5, -0.3), joint_encoders(heading))
+    assert len(run.after(250).innovation.sensors) == 5
+    for estimate in run.ticks(250):
+        assert (np.abs(run.unwrapped_error(estimate)) < SIGMAS * estimate.angle_sigmas).all()
+    assert (estimate.angle_sigmas < NOISE / 2.0).all()
+
+
+@pytest.mark.parametrize('branch', ['open', 'crossed'])
+@pytest.mark.parametrize('left_out', range(4))
+def test_start_needs_three_joint_encoders_beside_the_heading(
+    branch: str, left_out: int, uneven: Mechanism,
+) -> None:
+    """The angles around the loop follow either way, and tell the branch."""
+    run = Run(uneven, InitialState(3.0, 4.4, branch), joint_encoders('link_c'))
+    estimate = run.tick(tuple(sensor for sensor in range(5) if sensor != left_out))
+    assert estimate is not None
+    assert branch_of(estimate.link_angles) == branch
+    assert (np.abs(run.unwrapped_error(estimate)) < SIGMAS * estimate.angle_sigmas).all()
+
+
+def test_joint_encoders_alone_do_not_start_it(paper: Mechanism) -> None:
+    """They read the same however the whole is turned."""
+    run = Run(paper, InitialState(0.3, 1.6), joint_encoders('link_a'))
+    assert run.tick((0, 1, 2, 3)) is None
+    assert 'link_a' in run.estimator.waiting_for
+    assert run.tick() is not None
+
+
 @pytest.mark.parametrize(
     'links', [links for n in (1, 2, 3) for links in combinations(range(4), n)])
 def test_any_subset_of_links_keeps_it_going(links: tuple[int, ...], uneven: Mechanism) -> None:
@@ -124,7 +167,7 @@ def test_any_subset_of_links_keeps_it_going(links: tuple[int, ...], uneven: Mech
     run.after(100)
     for estimate in run.ticks(100, links):
         assert estimate.innovation is not None
-        assert estimate.innovation.links == links
+        assert estimate.innovation.sensors == links
         assert estimate.innovation.angles.shape == (len(links),)
         assert np.abs(run.unwrapped_error(estimate)).max() < SIGMAS * max(estimate.angle_sigmas)
 
@@ -260,7 +303,7 @@ def test_repeated_sample_is_rejected(running: Run) -> None:
     assert running.estimator.rejected == Counter(repeated=2)
 
 
-@pytest.mark.parametrize('age_ms', [4, 500, 999])
+@pytest.mark.parametrize('age_ms', [101, 500, 999])
 def test_late_sample_is_rejected(age_ms: int, running: Run) -> None:
     with pytest.raises(RejectedError) as caught:
         running.estimator.measure(running.stamp_ns - age_ms * 1_000_000, ['link_a'], [0.5])
@@ -326,12 +369,52 @@ def test_another_time_is_another_run(jump_ns: int, paper: Mechanism) -> None:
     assert not estimate.link_rates.any()
 
 
+def test_another_run_knows_nothing_of_the_sensors_of_the_last(paper: Mechanism) -> None:
+    """Time goes back, and a sensor of then is not there any more."""
+    run = Run(paper, InitialState())
+    run.stamp_ns += 10_000_000_000
+    run.after(10)
+    run.stamp_ns -= 5_000_000_000
+    run.plant.link_sensors.reset()
+    run.tick((0, 1, 3))
+    for _ in run.ticks(100, (0, 1, 3)):
+        assert run.estimator.sensor_faults() == {}
+
+
 def test_gap_of_less_is_bridged(paper: Mechanism) -> None:
     run = Run(paper, InitialState(), PERFECT)
     run.after(10)
     run.stamp_ns += 900_000_000
     assert run.tick() is not None
     assert run.estimator.starts == 1
+
+
+def test_reset_starts_again_on_the_same_turn(paper: Mechanism) -> None:
+    run = Run(paper, InitialState(0.0, 1.0, 'open', 6.0, 6.0), PERFECT)
+    before = run.after(600)
+    run.estimator.reset()
+    assert run.tick(()) is None
+    assert run.estimator.waiting_for
+    after = run.tick()
+    assert after is not None
+    assert run.estimator.starts == 2
+    # Two periods at 6 rad/s.
+    assert np.abs(after.link_angles - before.link_angles - 0.048).max() < 1e-3
+    # What was measured before stays forgotten, however late it comes: the rates are unknown.
+    assert after.rate_sigmas.min() > 1.0
+
+
+def test_reset_before_the_first_tick_does_nothing(paper: Mechanism) -> None:
+    run = Run(paper, InitialState())
+    run.estimator.reset()
+    assert run.tick() is not None
+
+
+def test_covariance_is_that_of_the_sigmas(paper: Mechanism) -> None:
+    estimate = Run(paper, InitialState()).after(50)
+    np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), [
+        *estimate.angle_sigmas[:2], *estimate.rate_sigmas[:2]], rtol=1e-12)
+    np.testing.assert_allclose(estimate.covariance, estimate.covariance.T, rtol=1e-12)
 
 
 @pytest.mark.parametrize('jump', [0.5, -2.0, 3.0])
@@ -352,3 +435,271 @@ def test_noise_alone_never_restarts_it(paper: Mechanism) -> None:
     run.after(2000)
     assert run.estimator.starts == 1
     assert not run.estimator.rejected
+
+
+# The gate
+
+def measured_with(run: Run, offsets: Array) -> Estimate:
+    """Advance by a period with offsets on what the four sensors say [rad]."""
+    estimate = run.tick(offsets=offsets)
+    assert estimate is not None and estimate.innovation is not None
+    return estimate
+
+
+@pytest.mark.parametrize('sensor', range(4))
+@pytest.mark.parametrize('offset', [0.05, -0.5, 3.0])
+def test_wrong_sensor_is_left_out_until_it_agrees_again(
+    sensor: int, offset: float, mechanism: Mechanism,
+) -> None:
+    run = Run(mechanism, InitialState(0.3, 1.6, 'open', 0.5, -0.3))
+    run.after(250)
+    gated = dict(run.estimator.gated)
+    for _ in range(100):
+        estimate = measured_with(run, offset * np.eye(4)[sensor])
+        assert estimate.innovation.used.tolist() == [link != sensor for link in range(4)]
+        assert estimate.innovation.degrees_of_freedom == 3
+        assert (np.abs(run.unwrapped_error(estimate)) < SIGMAS * estimate.angle_sigmas).all()
+    assert run.estimator.gated[LINK_NAMES[sensor]] == gated.get(LINK_NAMES[sensor], 0) + 100
+    assert run.estimator.sensor_faults() == {LINK_NAMES[sensor]: 'samples far off'}
+    for estimate in run.ticks(100):
+        assert estimate.innovation.used[sensor]
+    assert run.estimator.sensor_faults() == {}
+    assert run.estimator.starts == 1
+
+
+def test_gate_refuses_as_many_as_it_says(paper: Mechanism) -> None:
+    """One in a hundred of healthy samples, and healthy sensors are not named; seed 2."""
+    run = Run(paper, InitialState(0.3, 1.6, 'open', 0.5, -0.3), seed=2)
+    run.estimator = Estimator(paper, EstimatorSettings(
+        angle_noise=NOISE, disturbance_torque=1e-7, gate_probability=0.99))
+    run.after(250)
+    before = run.estimator.gated.total()
+    for _ in run.ticks(2000):
+        assert run.estimator.sensor_faults() == {}
+    # Counts of 8000 samples, nearly independent: 4 standard deviations of sqrt(80).
+    assert abs(run.estimator.gated.total() - before - 80) < 36
+
+
+@pytest.mark.parametrize('sensor', range(4))
+def test_stuck_sensor_is_named_at_once_and_left_out(sensor: int, mechanism: Mechanism) -> None:
+    """Even at rest, where its frozen sample fits better than any other."""
+    run = Run(mechanism, InitialState(0.3, 1.6))
+    run.after(250)
+    run.plant.link_sensors.set_faults({LINK_NAMES[sensor]: Fault(LINK_NAMES[sensor], 'stuck')})
+    run.after(48)
+    assert run.estimator.sensor_faults() == {}
+    estimate = run.after(1)
+    assert run.estimator.sensor_faults() == {LINK_NAMES[sensor]: 'repeats one value'}
+    assert estimate.innovation is not None
+    assert estimate.innovation.sensors == tuple(link for link in range(4) if link != sensor)
+    run.plant.link_sensors.set_faults({})
+    assert len(run.after(1).innovation.sensors) == 4
+    assert run.estimator.sensor_faults() == {}
+
+
+def test_links_at_rest_under_sensors_without_noise_are_not_stuck(paper: Mechanism) -> None:
+    run = Run(paper, InitialState(), PERFECT)
+    for _ in run.ticks(200):
+        assert run.estimator.sensor_faults() == {}
+    assert len(run.after(1).innovation.sensors) == 4
+
+
+def test_silent_sensor_is_named_and_comes_back(paper: Mechanism) -> None:
+    run = Run(paper, InitialState(0.3, 1.6))
+    run.after(50)
+    for n, _ in enumerate(run.ticks(60, (0, 1, 3)), 1):
+        # After 0.2 s, fifty ticks.
+        assert run.estimator.sensor_faults() == ({'link_c': 'no data'} if n > 50 else {})
+    run.after(1)
+    assert run.estimator.sensor_faults() == {}
+
+
+@pytest.mark.parametrize('garbage', [False, True])
+def test_blind_for_a_second_and_then_lost(garbage: bool, paper: Mechanism) -> None:
+    """Whether nothing comes or nothing of use; a good sample starts it anew, on the same turn."""
+    run = Run(paper, InitialState(0.3, 1.6, 'open', 0.4, -0.3))
+    run.after(250)
+
+    def blind() -> Estimate | None:
+        if garbage:
+            run.estimator.measure(
+                run.stamp_ns + PERIOD_NS, ['link_a'], [3.0 + 0.1 * (run.stamp_ns % 7)])
+        return run.tick(())
+    for _ in range(250):
+        estimate = blind()
+        assert estimate is not None
+        assert np.abs(run.unwrapped_error(estimate)).max() < pi / 180.0
+    assert blind() is None
+    assert 'the estimate is lost' in run.estimator.waiting_for
+    assert run.tick(()) is None
+    back = run.tick()
+    assert back is not None
+    assert np.abs(run.unwrapped_error(back)).max() < SIGMAS * NOISE
+    assert run.estimator.waiting_for == ''
+    assert run.estimator.starts == 2
+
+
+def test_without_a_gate_everything_is_used(paper: Mechanism) -> None:
+    run = Run(paper, InitialState())
+    run.estimator = Estimator(paper, EstimatorSettings(gate_probability=1.0))
+    run.after(100)
+    assert measured_with(run, np.array([0.5, 0.0, 0.0, 0.0])).innovation.used.all()
+    assert not run.estimator.gated
+
+
+# Late
+
+HISTORY_MS = 100
+
+
+class Delivered:
+    """
+    Ticks and measurements of one motion, to be delivered when somebody says.
+
+    :ivar ticks: stamp [ns] and wheel speeds of each.
+    :ivar samples: stamp [ns], links, angles of each, several per tick or none, between the ticks.
+    """
+
+    def __init__(self, mechanism: Mechanism, seed: int, count: int = 150) -> None:
+        rng = np.random.default_rng(seed)
+        plant = Plant(mechanism, PERFECT, InitialState(0.3, 1.6, 'open', 2.0, -0.5), 5e-4, rng)
+        self.ticks: list[tuple[int, Array]] = []
+        self.samples: list[tuple[int, list[str], Array]] = []
+        stamp_ns = FIRST_NS
+        for _ in range(count):
+            torques = rng.uniform(-5e-5, 5e-5, 4)
+            before = plant.sense_wheels()
+            for _ in range(8):
+                plant.advance(1, torques)
+                stamp_ns += PERIOD_NS // 8
+                if rng.random() < 0.15:
+                    # Now and then in two messages of one stamp.
+                    links = rng.permutation(4)
+                    angles = plant.truth().link_angles[links] + NOISE * rng.standard_normal(4)
+                    cut = int(rng.integers(1, 5))
+                    for part in (slice(0, cut), slice(cut, 4)):
+                        if links[part].size:
+                            self.samples.append((stamp_ns, names_of(*links[part]), angles[part]))
+            self.ticks.append((stamp_ns, (plant.sense_wheels() - before) / 4e-3))
+        # What would start the filter, whatever comes first.
+        start = FIRST_NS + PERIOD_NS // 16
+        self.samples.insert(0, (start, names_of(0, 1, 2, 3), assemble(mechanism, 0.3, 1.6)))
+
+    def estimates(self, mechanism: Mechanism, delays_ns: Array) -> list[Estimate | None]:
+        """Deliver each sample so long after its stamp, in the order in which they arrive."""
+        estimator = Estimator(mechanism, EstimatorSettings())
+        arrivals = sorted(
+            (stamp + int(delay), n) for n, ((stamp, *_), delay)
+            in enumerate(zip(self.samples, delays_ns)))
+        estimates = []
+        for tick_ns, speeds in self.ticks:
+            while arrivals and arrivals[0][0] <= tick_ns:
+                stamp, names, angles = self.samples[arrivals.pop(0)[1]]
+                estimator.measure(stamp, names, list(angles))
+            estimates.append(estimator.tick(tick_ns, speeds))
+        assert not estimator.rejected
+        assert estimator.starts == 1
+        return estimates
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_estimate_depends_on_what_arrived_and_not_on_when(
+    seed: int, mechanism: Mechanism,
+) -> None:
+    """Delays of up to 0.1 s, each sample its own: what is in at a tick is all that counts."""
+    told = Delivered(mechanism, seed)
+    rng = np.random.default_rng(seed + 100)
+    in_time = told.estimates(mechanism, np.zeros(len(told.samples)))
+    delays = rng.uniform(0.0, HISTORY_MS * 1e6, len(told.samples))
+    # The last ones arrive, all of them, with the last tick.
+    end_ns = told.ticks[-1][0]
+    delays = np.minimum(delays, [end_ns - stamp for stamp, *_ in told.samples])
+    late = told.estimates(mechanism, delays)
+    final, wanted = late[-1], in_time[-1]
+    assert final is not None
+    assert wanted is not None
+    for name in ('link_angles', 'link_rates', 'angle_sigmas', 'rate_sigmas'):
+        np.testing.assert_allclose(
+            getattr(final, name), getattr(wanted, name), rtol=0.0, atol=1e-12,
+            err_msg=f'{name}, seed {seed}')
+    # On the way there much was missing, so that the above is no matter of course.
+    middle = late[len(late) // 2], in_time[len(late) // 2]
+    assert middle[0] is not None
+    assert middle[1] is not None
+    assert not np.allclose(middle[0].link_angles, middle[1].link_angles, rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize('latency_ms', [1, 5, 40])
+def test_latency_makes_no_error_in_motion(latency_ms: int, mechanism: Mechanism) -> None:
+    """At 5 rad/s the sample of 5 ms ago is off by 25 mrad, ten times what is tolerated."""
+    run = Run(mechanism, InitialState(0.3, 1.6, 'open', 5.0, 5.0))
+    rng = np.random.default_rng(7)
+    waiting: list[tuple[int, Array]] = []
+    estimates = []
+    for _ in range(400):
+        before = run.plant.sense_wheels()
+        run.plant.advance(8, np.zeros(4))
+        run.stamp_ns += PERIOD_NS
+        noise = NOISE * rng.standard_normal(4)
+        waiting.append((run.stamp_ns, run.plant.truth().link_angles + noise))
+        while waiting and waiting[0][0] + latency_ms * 1_000_000 <= run.stamp_ns:
+            stamp, angles = waiting.pop(0)
+            run.estimator.measure(stamp, list(LINK_NAMES), list(angles))
+        estimate = run.estimator.tick(
+            run.stamp_ns, (run.plant.sense_wheels() - before) / 4e-3)
+        if estimate is not None:
+            estimates.append((estimate, run.unwrapped_error(estimate)))
+    assert run.estimator.starts == 1
+    assert not run.estimator.rejected
+    for estimate, error in estimates[-150:]:
+        assert (np.abs(error) < SIGMAS * estimate.angle_sigmas).all()
+        assert np.abs(error).max() < 2.5e-3
+        assert estimate.innovation is not None
+
+
+def test_sample_as_old_as_the_history_is_taken(running: Run) -> None:
+    running.after(50)
+    truth = running.plant.truth().link_angles
+    running.ticks(1, ())
+    stamp = running.stamp_ns - HISTORY_MS * 1_000_000 + 1_000_000
+    running.estimator.measure(stamp, list(LINK_NAMES), list(truth))
+    (estimate,) = running.ticks(1, ())
+    assert estimate.innovation is not None
+    assert not running.estimator.rejected
+
+
+def test_sample_that_was_there_is_rejected_however_late(running: Run) -> None:
+    running.after(20)
+    with pytest.raises(RejectedError) as caught:
+        running.estimator.measure(running.stamp_ns - 5 * PERIOD_NS, ['link_b'], [0.5])
+    assert caught.value.kind == 'repeated'
+
+
+def test_start_from_a_late_sample_is_brought_forward(mechanism: Mechanism) -> None:
+    """Nothing came for ten ticks; the first sample is that old, and the wheels moved since."""
+    run = Run(mechanism, InitialState(0.3, 1.6), PERFECT)
+    first = run.plant.truth().link_angles
+    stamp = run.stamp_ns + PERIOD_NS
+    torques = np.array([1e-4, -1e-4, 1e-4, -1e-4])
+    assert run.tick((), np.zeros(4)) is None
+    for _ in range(9):
+        assert run.tick((), torques) is None
+    run.estimator.measure(stamp, list(LINK_NAMES), list(first))
+    estimate = run.tick((), torques)
+    assert estimate is not None
+    truth = run.plant.truth().link_angles
+    moved = np.abs(truth - first).max()
+    # The encoders tell speeds half a period late: 1 - (9.5 / 10)^2 of ten periods from rest.
+    assert np.abs(run.unwrapped_error(estimate)).max() < 0.11 * moved
+
+
+def test_new_start_in_the_same_run_stays_on_its_turn(paper: Mechanism) -> None:
+    """Lost after two turns, it does not jump back by them: the controller would follow."""
+    run = Run(paper, InitialState(0.0, 1.0, 'open', 6.0, 6.0), PERFECT)
+    before = run.after(600)
+    assert before.link_angles.min() > 4.0 * pi
+    elsewhere = Run(paper, InitialState(1.0, 2.5), PERFECT)
+    elsewhere.estimator, elsewhere.stamp_ns = run.estimator, run.stamp_ns
+    after = elsewhere.after(30)
+    assert run.estimator.starts == 2
+    assert np.abs(after.link_angles - before.link_angles).max() < 1.5 * pi

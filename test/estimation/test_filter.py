@@ -20,9 +20,12 @@ from filterpy.kalman import ExtendedKalmanFilter
 from fourbar_ros.estimation.filter import LinkageFilter
 from fourbar_ros.mechanism import assemble, Mechanism, nearest_assembly, reduced_form
 from fourbar_ros.mechanism.angles import wrap_angles
-from fourbar_ros.mechanism.motion import advance_state, STATE_SIZE
+from fourbar_ros.mechanism.forces import NOTHING
+from fourbar_ros.mechanism.layout import STATE_SIZE
+from fourbar_ros.mechanism.motion import move_held
 from fourbar_ros.plant import InitialState, Plant, Table
-from fourbar_ros.plant.table import LinkSensors, WheelEncoders
+from fourbar_ros.plant.sensors import LinkSensorSettings
+from fourbar_ros.plant.table import WheelEncoders
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -92,7 +95,7 @@ def test_prediction_and_transition_are_those_of_the_linkage(
 
 def test_wheel_motion_predicts_the_plant(mechanism: Mechanism) -> None:
     """Motor torques are nowhere in the filter: what the wheels did tells what the links did."""
-    plant = Plant(mechanism, Table(LinkSensors(0.0, 0), WheelEncoders(0)),
+    plant = Plant(mechanism, Table(LinkSensorSettings(), WheelEncoders(0)),
                   InitialState(0.3, 1.6, 'open', 1.0, -0.5), 5e-4, np.random.default_rng(0))
     truth = plant.truth()
     linkage = LinkageFilter(mechanism, truth.link_angles, 1e-6, 1e-4, 0.0)
@@ -136,8 +139,7 @@ def monte_carlo(mechanism: Mechanism, seed: int) -> Consistency:
     errors, nees = np.empty((*shape, 4)), np.empty(shape)
     nis, whitened = np.empty(shape), np.empty((*shape, 4))
     link_errors, sigmas = np.empty((*shape, 8)), np.empty((*shape, 8))
-    constants = mechanism.constants_with_locked_wheels
-    scratch = np.empty((6, STATE_SIZE))
+    constants = mechanism.constants_with(np.ones(4, dtype=bool))
     for run in range(RUNS):
         angles = assemble(mechanism, 0.2, 1.5)
         linkage = LinkageFilter(mechanism, angles, NOISE ** 2, START_RATE ** 2, DISTURBANCE)
@@ -151,10 +153,9 @@ def monte_carlo(mechanism: Mechanism, seed: int) -> Consistency:
             # White torque in two pieces per period; the filter takes it as continuous.
             for _ in range(2):
                 disturbed = wheels + DISTURBANCE / np.sqrt(PERIOD / 2) * rng.standard_normal(4)
-                advance_state(
-                    state, disturbed, disturbed, disturbed, PERIOD / 2, constants, scratch)
+                move_held(state, disturbed, PERIOD / 2, 1, constants, NOTHING)
             linkage.move(PERIOD, wheels)
-            innovation, nis[run, tick] = linkage.correct(
+            innovation, nis[run, tick], _ = linkage.correct(
                 ALL, state[:4] + NOISE * rng.standard_normal(4), NOISE ** 2)
             whitened[run, tick] = np.linalg.solve(np.linalg.cholesky(linkage.S), innovation)
             error = linkage.x - state[[0, 1, 4, 5]]
@@ -271,17 +272,47 @@ def test_measured_link_tells_its_partner(paper: Mechanism) -> None:
     np.testing.assert_allclose(linkage.angles, target, rtol=0.0, atol=1e-7)
 
 
-@pytest.mark.parametrize('links', [(0, 1, 2, 3), (0, 2), (3,)], ids=str)
+@pytest.mark.parametrize('wrong', [(0,), (1, 2), (0, 3)], ids=str)
+def test_gate_leaves_out_what_is_far_off_and_nothing_else(
+    wrong: tuple[int, ...], uneven: Mechanism,
+) -> None:
+    """The rest does what it would do alone."""
+    angles = assemble(uneven, 0.2, 1.5)
+    measured = angles + [1e-3, -1e-3, 2e-3, 0.0]
+    right = tuple(link for link in ALL if link not in wrong)
+    gated, alone = (LinkageFilter(uneven, angles, 1e-6, 1e-4, 1e-7) for _ in range(2))
+    nis = alone.correct(right, measured[list(right)], 1e-6)[1]
+    measured[list(wrong)] += 0.1
+    innovation, found, used = gated.correct(ALL, measured, 1e-6, gate=15.0)
+    assert used.tolist() == [link in right for link in ALL]
+    assert found == pytest.approx(nis, rel=1e-12)
+    np.testing.assert_allclose(innovation, measured - angles, rtol=1e-12)
+    np.testing.assert_allclose(gated.x, alone.x, rtol=1e-14)
+    np.testing.assert_allclose(gated.P, alone.P, rtol=1e-12, atol=1e-20)
+
+
+def test_nothing_within_the_gate_changes_nothing(paper: Mechanism) -> None:
+    angles = assemble(paper, 0.2, 1.5)
+    linkage = LinkageFilter(paper, angles, 1e-6, 1e-4, 1e-7)
+    before = [array.copy() for array in linkage.snapshot()]
+    _, nis, used = linkage.correct(ALL, angles + 0.5, 1e-6, gate=15.0)
+    assert nis == 0.0 and not used.any()
+    for then, now in zip(before, linkage.snapshot()):
+        assert then.tobytes() == now.tobytes()
+
+
+@pytest.mark.parametrize(
+    'sensors', [(0, 1, 2, 3), (0, 2), (3,), (1, 4, 5, 6, 7), (4, 6)], ids=str)
 @pytest.mark.parametrize('seed', range(5))
 def test_compiled_steps_are_those_of_filterpy(
-    links: tuple[int, ...], seed: int, mechanism: Mechanism,
+    sensors: tuple[int, ...], seed: int, mechanism: Mechanism,
 ) -> None:
     """Predict and correct once, and let filterpy do the same with the same matrices."""
     rng = np.random.default_rng(seed)
     angles = assemble(mechanism, 3.0, 4.3)
     linkage = LinkageFilter(mechanism, angles, 1e-4, 1e-2, 1e-5)
     linkage.move(PERIOD, mechanism.flywheel_inertias * rng.normal(size=4))
-    textbook = ExtendedKalmanFilter(dim_x=4, dim_z=len(links))
+    textbook = ExtendedKalmanFilter(dim_x=4, dim_z=len(sensors))
     textbook.x, textbook.P = np.array([3.0, 4.3, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-2, 1e-2])
     textbook.F, textbook.Q = linkage.F, linkage.Q
     textbook.predict()
@@ -289,15 +320,18 @@ def test_compiled_steps_are_those_of_filterpy(
 
     # From here on the same state, which the linkage moves better than F alone.
     textbook.x = linkage.x.copy()
-    predicted = linkage.angles[list(links)]
-    jacobian = np.zeros((len(links), 4))
-    jacobian[:, :2] = np.vstack([np.eye(2), linkage.gamma])[list(links)]
-    measured = predicted + rng.normal(scale=1e-3, size=len(links)) - 2.0 * np.pi
+    # Joints 1 to 4: b to a, c to b, d to c, a to d.
+    of_links = np.vstack([np.eye(4), np.roll(np.eye(4), 1, axis=1) - np.eye(4)])[list(sensors)]
+    predicted = of_links @ linkage.angles
+    jacobian = np.zeros((len(sensors), 4))
+    jacobian[:, :2] = of_links @ np.vstack([np.eye(2), linkage.gamma])
+    measured = predicted + rng.normal(scale=1e-3, size=len(sensors)) - 2.0 * np.pi
     variance = 3e-6
     textbook.update(
-        measured, lambda x: jacobian, lambda x: predicted, R=variance * np.eye(len(links)),
+        measured, lambda x: jacobian, lambda x: predicted, R=variance * np.eye(len(sensors)),
         residual=lambda z, h: wrap_angles(z - h))
-    innovation, nis = linkage.correct(links, measured, variance)
+    innovation, nis, used = linkage.correct(sensors, measured, variance)
+    assert used.all()
     np.testing.assert_allclose(innovation, textbook.y, rtol=0.0, atol=1e-14)
     np.testing.assert_allclose(linkage.x, textbook.x, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(linkage.K, textbook.K, rtol=1e-12, atol=1e-12)

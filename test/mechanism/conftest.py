@@ -17,7 +17,9 @@
 from collections.abc import Callable
 
 from fourbar_ros.mechanism import assemble, Mechanism, reduced_form
-from fourbar_ros.mechanism.motion import move_with_cosine_torques, STATE_SIZE
+from fourbar_ros.mechanism.forces import NOTHING
+from fourbar_ros.mechanism.layout import make_state, WHEEL_ANGLES
+from fourbar_ros.mechanism.motion import move_with_cosines
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -68,15 +70,16 @@ def _random_state(rng: np.random.Generator, linkage: Mechanism, fold: float = 0.
             break
     rates = rng.uniform(-1.0, 1.0, 2)
     dependent = reduced_form(linkage, angles, rates).gamma @ rates
-    return np.concatenate(
-        [angles, rates, dependent, rng.uniform(-np.pi, np.pi, 4), rng.uniform(-9.0, 9.0, 4)])
+    state = make_state(angles, np.concatenate([rates, dependent]), rng.uniform(-9.0, 9.0, 4))
+    state[WHEEL_ANGLES] = rng.uniform(-np.pi, np.pi, 4)
+    return state
 
 
 def _move_freely(linkage: Mechanism, start: Array, step: float, steps: int) -> Array:
-    """Return the states (steps + 1, 16) after every step of motion without torque."""
-    return move_with_cosine_torques(
+    """Return the states (steps + 1, STATE_SIZE) after every step of motion without torque."""
+    return move_with_cosines(
         start, step * np.arange(steps + 1), np.zeros(4), np.zeros(4), np.zeros(4),
-        1.5 * step, linkage.constants)
+        1.5 * step, linkage.constants, NOTHING)
 
 
 # For the tests: what they may ask of the fixtures.
@@ -97,8 +100,7 @@ def random_parallelogram() -> Draw:
 
 @pytest.fixture(scope='session')
 def random_state() -> Callable[..., Array]:
-    """Draw a state (16,) of a linkage that meets its closure, in angles and rates."""
-    assert STATE_SIZE == 16
+    """Draw a state (STATE_SIZE,) of a linkage that meets its closure, in angles and rates."""
     return _random_state
 
 

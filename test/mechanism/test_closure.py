@@ -24,8 +24,17 @@ from fourbar_ros.mechanism import (
     ClosureError,
     Mechanism,
     nearest_assembly,
+    reduced_form,
 )
-from fourbar_ros.mechanism.closure import assemble_along, BRANCHES, solve_pair, wrap
+from fourbar_ros.mechanism.closure import (
+    assemble_along,
+    BRANCHES,
+    check_motion,
+    FOLDED,
+    solve_pair,
+    TOLERANCE,
+    wrap,
+)
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -278,3 +287,89 @@ def test_path_that_opens_the_loop_is_refused_where_it_does() -> None:
     start = assemble(mechanism, 0.0, 1.0)
     with pytest.raises(ClosureError, match=r'cannot close at link_a = 0\.0000 rad'):
         assemble_along(mechanism, np.zeros(50), np.linspace(1.0, pi, 50), start)
+
+
+# --- Folded -----------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('turns', [0.0, 2.0 * pi, -6.0 * pi])
+@pytest.mark.parametrize('apart', [1e-5, 0.3, -1.0, 3.0])
+@pytest.mark.parametrize('angle', [0.0, 0.7, -2.0])
+def test_two_pairs_of_links_on_each_other_are_folded(
+    angle: float, apart: float, turns: float,
+) -> None:
+    """Joint 4 lies on joint 2, which is a motion of its own where l_a = l_b and l_c = l_d."""
+    angles = np.array([angle, angle, angle + apart, angle + apart]) + [0.0, turns, 0.0, -turns]
+    assert closure_error(linkage((0.15, 0.15, 0.08, 0.08)), angles) < EXACT
+    assert branch_of(angles) == 'folded'
+
+
+@pytest.mark.parametrize('theta', [0.0, pi, -pi, 2.0 * pi])
+def test_change_point_itself_is_not_folded(theta: float) -> None:
+    """All branches meet there."""
+    assert branch_of([0.4, 0.4 + theta, 0.4, 0.4 + theta]) == 'open'
+
+
+@pytest.mark.parametrize(('within', 'branch'), [(0.5, 'folded'), (2.0, 'crossed')])
+def test_fold_is_one_up_to_a_small_angle(within: float, branch: str) -> None:
+    """In a linkage that does not quite match the pairs lie on each other only nearly."""
+    small = within * FOLDED
+    assert branch_of([0.0, small, 1.0, 1.0 - small]) == branch
+
+
+# --- Which motions can be ---------------------------------------------------------------------
+
+@given(case=assembled(), rates=st.tuples(*[st.floats(-5.0, 5.0)] * 2))
+@repeatable
+def test_motion_on_the_closure_is_accepted(
+    case: tuple[Mechanism, Array, str], rates: tuple[float, float],
+) -> None:
+    mechanism, angles, _ = case
+    gamma = reduced_form(mechanism, angles, rates).gamma
+    check_motion(mechanism, angles, [*rates, *(gamma @ rates)])
+
+
+@given(phi_a=st.floats(-10.0, 10.0), theta=st.floats(0.1, 3.0), link=st.sampled_from(range(4)))
+@repeatable
+def test_gap_is_accepted_up_to_its_limit(phi_a: float, theta: float, link: int) -> None:
+    """One link of a rhombus turned by x opens it by x times its length."""
+    mechanism = linkage((0.1,) * 4)
+    angles = assemble(mechanism, phi_a, phi_a + theta)
+    turned = np.eye(4)[link] * TOLERANCE
+    check_motion(mechanism, angles + 0.99 * turned, np.zeros(4))
+    with pytest.raises(ClosureError, match='do not close the loop: gap 1.01e-07 m, limit 1e-07 m'):
+        check_motion(mechanism, angles + 1.01 * turned, np.zeros(4))
+
+
+@given(phi_a=st.floats(-10.0, 10.0), theta=st.floats(0.1, 3.0), link=st.sampled_from(range(4)))
+@repeatable
+def test_opening_is_accepted_up_to_its_limit(phi_a: float, theta: float, link: int) -> None:
+    """A rigid turn of the whole opens nothing, one link faster by x opens it by x its length."""
+    mechanism = linkage((0.1,) * 4)
+    angles = assemble(mechanism, phi_a, phi_a + theta)
+    faster = np.eye(4)[link] * TOLERANCE
+    check_motion(mechanism, angles, 3.0 + 0.99 * faster)
+    with pytest.raises(ClosureError, match=(
+            'do not keep the loop closed: joint 3 would open at 1.01e-07 m/s, limit 1e-07 m/s')):
+        check_motion(mechanism, angles, 3.0 + 1.01 * faster)
+
+
+def test_limit_is_relative_to_the_longest_link() -> None:
+    mechanism = linkage((40.0, 10.0, 40.0, 10.0))
+    angles = assemble(mechanism, 0.0, 1.0)
+    with pytest.raises(ClosureError, match='gap 0.1 m, limit 4e-05 m'):
+        check_motion(mechanism, angles + [0.0, 0.01, 0.0, 0.0], np.zeros(4))
+
+
+@pytest.mark.parametrize('value', [np.nan, inf, -inf])
+@pytest.mark.parametrize('link', range(4))
+def test_state_that_is_not_finite_is_refused_with_the_link(link: int, value: float) -> None:
+    mechanism = linkage((0.1,) * 4)
+    sound, broken = np.array([0.0, 1.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0, 1.0])
+    broken[link] = value
+    name = f'link_{"abcd"[link]}'
+    with pytest.raises(ClosureError) as refusal:
+        check_motion(mechanism, broken, np.zeros(4))
+    assert str(refusal.value) == f'the angle of {name} must be finite, got {value} rad'
+    with pytest.raises(ClosureError) as refusal:
+        check_motion(mechanism, sound, broken)
+    assert str(refusal.value) == f'the rate of {name} must be finite, got {value} rad/s'

@@ -14,6 +14,7 @@
 
 """Compiled code is kept between processes, but never longer than it is right."""
 
+import io
 import json
 import os
 from pathlib import Path
@@ -170,3 +171,23 @@ def test_folders_unused_for_long_are_dropped_and_others_kept(run, tmp_path):
     assert run()['loaded'] == 1
     assert {path.name for path in cache.iterdir()} == {
         'fedcba9876543210', 'not ours', in_use.name}
+
+
+def test_compilation_is_announced_once() -> None:
+    """One line however many kernels there are, and none where the code is there already."""
+    @compiled.kernel(cache=False)
+    def halve(number: float) -> float:
+        return 0.5 * number
+
+    @compiled.kernel(cache=False)
+    def quarter(number: float) -> float:
+        return float(halve(halve(number)))
+
+    first, second = io.StringIO(), io.StringIO()
+    with compiled.announced(first):
+        assert quarter(8.0) == 2.0
+    with compiled.announced(second):
+        assert quarter(4.0) == 1.0
+    assert first.getvalue().count('\n') == 1
+    assert first.getvalue().startswith('Compiling the kernels')
+    assert second.getvalue() == ''

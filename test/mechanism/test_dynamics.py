@@ -24,20 +24,18 @@ from fourbar_ros.mechanism import (
     Mechanism,
     reduced_form,
 )
-from fourbar_ros.mechanism.dynamics import (
-    _constrained_accelerations,
-    _reduced_accelerations,
-    ChangePointError,
-    link_accelerations,
-    mass_matrix,
-)
-from fourbar_ros.mechanism.motion import (
+from fourbar_ros.mechanism.constrained import constrained_accelerations, directions
+from fourbar_ros.mechanism.dynamics import ChangePointError, mass_matrix
+from fourbar_ros.mechanism.forces import NOTHING
+from fourbar_ros.mechanism.layout import (
     LINK_ANGLES,
     LINK_RATES,
-    state_derivative,
+    make_state,
     WHEEL_ANGLES,
     WHEEL_SPEEDS,
 )
+from fourbar_ros.mechanism.motion import evaluate
+from fourbar_ros.mechanism.reduced import reduced_accelerations, side_of_joint_3
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -63,13 +61,27 @@ def condition(linkage: Mechanism, theta: float) -> float:
     return float(np.linalg.cond(reduced_form(linkage, angles, [0.0, 0.0]).mass_matrix))
 
 
-def accelerations(
-    solve: Callable[..., None], linkage: Mechanism, state: Array, torques: Array,
-) -> Array:
-    """Run one of the compiled solvers on motor torques."""
-    out = np.empty(4)
-    solve(state[LINK_ANGLES], state[LINK_RATES], -torques, linkage.constants, out)
-    return out
+def accelerations(linkage: Mechanism, state: Array, torques: Array) -> Array:
+    """Return the accelerations of the links under motor torques, whichever way is taken."""
+    out = np.empty_like(state)
+    evaluate(state, torques, linkage.constants, NOTHING, out)
+    return out[LINK_RATES]
+
+
+def by_reduced_form(linkage: Mechanism, state: Array, torques: Array) -> Array:
+    """Return the accelerations of the links by the reduced form."""
+    theta = state[1] - state[0]
+    return np.array(reduced_accelerations(
+        state[0], np.cos(theta), np.sin(theta), side_of_joint_3(state[2], state[3]), state[4],
+        state[5], 0.0, 0.0, torques, linkage.constants, NOTHING)[:4])
+
+
+def by_constrained_form(linkage: Mechanism, state: Array, torques: Array) -> Array:
+    """Return the accelerations of the links by the constrained form."""
+    cosines, sines = directions(tuple(state[LINK_ANGLES]))
+    return np.array(constrained_accelerations(
+        state[0], cosines, sines, tuple(state[LINK_RATES]), (0.0, 0.0), torques,
+        linkage.constants, NOTHING)[0])
 
 
 # --- Facts ------------------------------------------------------------------------------------
@@ -163,7 +175,7 @@ def test_accelerations_keep_the_closure(
     linkage = random_linkage(rng)
     state = random_state(rng, linkage)
     torques = rng.uniform(-1.0, 1.0, 4)
-    alpha = accelerations(link_accelerations, linkage, state, torques)
+    alpha = accelerations(linkage, state, torques)
     arms = np.array([-1.0, 1.0, 1.0, -1.0]) * linkage.link_lengths * np.exp(1j * state[:4])
     gap = np.sum(arms * (1j * alpha - state[LINK_RATES]**2))
     assert abs(gap) < 1e-13 * np.abs(arms * (1j * alpha - state[LINK_RATES]**2)).sum() / 0.3
@@ -195,8 +207,8 @@ def test_reduced_and_constrained_solutions_agree(
     linkage = random_linkage(rng)
     state = random_state(rng, linkage, fold)
     torques = rng.uniform(-1.0, 1.0, 4)
-    reduced = accelerations(_reduced_accelerations, linkage, state, torques)
-    constrained = accelerations(_constrained_accelerations, linkage, state, torques)
+    reduced = by_reduced_form(linkage, state, torques)
+    constrained = by_constrained_form(linkage, state, torques)
     sine = np.sin(state[3] - state[2])
     np.testing.assert_allclose(
         reduced, constrained, rtol=0.0, atol=1e-13 / sine**2 * np.abs(constrained).max())
@@ -211,8 +223,8 @@ def test_accelerations_are_finite_at_a_change_point(
     linkage = random_parallelogram(rng)
     phi_a = rng.uniform(-3.0, 3.0)
     rates = rng.uniform(-1.0, 1.0, 2)
-    state = np.concatenate([np.tile([phi_a, phi_a + theta], 2), np.tile(rates, 2), np.zeros(8)])
-    alpha = accelerations(link_accelerations, linkage, state, np.zeros(4))
+    state = make_state(np.tile([phi_a, phi_a + theta], 2), np.tile(rates, 2))
+    alpha = accelerations(linkage, state, np.zeros(4))
     assert np.isfinite(alpha).all()
 
 
@@ -264,7 +276,7 @@ def maximal() -> Callable[[Mechanism, Array, Array], tuple[Array, float, float]]
         masses[i] * (xs[i] * ys[i].diff(time) - ys[i] * xs[i].diff(time))
         + inertias[i] * phis[i].diff(time) + wheels[i] * psis[i].diff(time) for i in range(4))
     arguments = [speeds, coordinates, lengths, masses, inertias, along, across, wheels, torques]
-    evaluate = sympy.lambdify(
+    terms = sympy.lambdify(
         arguments, [method.mass_matrix, method.forcing, method.lam_coeffs,
                     (jacobian * sympy.Matrix(speeds)).diff(time).subs(
                         {speed.diff(time): 0 for speed in speeds}),
@@ -288,7 +300,7 @@ def maximal() -> Callable[[Mechanism, Array, Array], tuple[Array, float, float]]
         q = np.concatenate([centres.real, centres.imag, state[LINK_ANGLES], wheel_angles])
         dq = np.concatenate(
             [moving.real, moving.imag, state[LINK_RATES], state[WHEEL_SPEEDS]])
-        matrix, force, reaction, centripetal, jac, gap, kinetic, spin_sum = evaluate(
+        matrix, force, reaction, centripetal, jac, gap, kinetic, spin_sum = terms(
             dq, q, *bodies)
         assert np.abs(gap).max() < 1e-14
         assert np.abs(jac @ dq).max() < 1e-13
@@ -311,8 +323,8 @@ def test_accelerations_agree_with_an_independent_model(
     state = random_state(rng, linkage)
     torques = rng.uniform(-1.0, 1.0, 4)
     expected = maximal(linkage, state, torques)[0]
-    ours = np.empty(16)
-    state_derivative(state, torques, linkage.constants, np.empty(4), ours)
+    ours = np.empty_like(state)
+    evaluate(state, torques, linkage.constants, NOTHING, ours)
     # Rounding times the condition number of 24 equations in units of order one.
     np.testing.assert_allclose(
         ours[LINK_RATES], expected[:4], rtol=0.0, atol=1e-11 * np.abs(expected[:4]).max())
@@ -345,7 +357,7 @@ def test_energy_agrees_with_an_independent_model(
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     state = random_state(rng, linkage)
-    ours = kinetic_energy(linkage, *np.split(state, 4)[:2], state[WHEEL_SPEEDS])
+    ours = kinetic_energy(linkage, *np.split(state[:8], 2), state[WHEEL_SPEEDS])
     assert ours == pytest.approx(maximal(linkage, state, np.zeros(4))[1], rel=1e-13)
 
 
@@ -357,7 +369,7 @@ def test_momentum_agrees_with_an_independent_model(
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     state = random_state(rng, linkage)
-    ours = angular_momentum(linkage, *np.split(state, 4)[:2], state[WHEEL_SPEEDS])
+    ours = angular_momentum(linkage, *np.split(state[:8], 2), state[WHEEL_SPEEDS])
     expected = maximal(linkage, state, np.zeros(4))[2]
     assert ours == pytest.approx(expected, rel=1e-13, abs=1e-13)
 
@@ -367,8 +379,8 @@ def test_momentum_agrees_with_an_independent_model(
 def rate_of(quantity: Callable[..., float], linkage: Mechanism, state: Array, torques: Array
             ) -> float:
     """Differentiate along the motion, central differences of sixth order."""
-    slope = np.empty(16)
-    state_derivative(state, torques, linkage.constants, np.empty(4), slope)
+    slope = np.empty_like(state)
+    evaluate(state, torques, linkage.constants, NOTHING, slope)
     step = 2e-3 / max(1.0, np.abs(slope[LINK_RATES]).max())
     rate = 0.0
     for k, weight in ((1, 45.0), (2, -9.0), (3, 1.0)):
@@ -396,8 +408,8 @@ def test_energy_changes_by_the_power_of_the_motors(
     torques = rng.uniform(-1.0, 1.0, 4)
     power = torques @ (state[WHEEL_SPEEDS] - state[LINK_RATES])
     rate = rate_of(kinetic_energy, linkage, state, torques)
-    energy = kinetic_energy(linkage, *np.split(state, 4)[:2], state[WHEEL_SPEEDS])
-    alpha = accelerations(link_accelerations, linkage, state, torques)
+    energy = kinetic_energy(linkage, *np.split(state[:8], 2), state[WHEEL_SPEEDS])
+    alpha = accelerations(linkage, state, torques)
     bound = 10.0 * ROUNDING_OF_RATES * energy * max(1.0, np.abs(alpha).max())
     assert rate == pytest.approx(power, rel=0.0, abs=bound)
 
@@ -413,7 +425,7 @@ def test_momentum_does_not_change_under_motor_torques(
     rate = rate_of(angular_momentum, linkage, state, torques)
     size = (np.abs(linkage.constants.cosine).sum() * np.abs(state[LINK_RATES]).max()
             + linkage.flywheel_inertias @ np.abs(state[WHEEL_SPEEDS]))
-    alpha = accelerations(link_accelerations, linkage, state, torques)
+    alpha = accelerations(linkage, state, torques)
     assert abs(rate) < 10.0 * ROUNDING_OF_RATES * size * max(1.0, np.abs(alpha).max())
 
 
@@ -427,10 +439,10 @@ def test_opposite_torques_on_opposite_wheels_only_load_the_joints(
     theta = rng.uniform(0.3, np.pi - 0.3)
     phi_a = rng.uniform(-3.0, 3.0)
     rates = rng.uniform(-1.0, 1.0, 2)
-    state = np.concatenate([np.tile([phi_a, phi_a + theta], 2), np.tile(rates, 2), np.zeros(8)])
+    state = make_state(np.tile([phi_a, phi_a + theta], 2), np.tile(rates, 2))
     first, second = rng.uniform(-1.0, 1.0, 2)
     with_torques = accelerations(
-        link_accelerations, linkage, state, np.array([first, second, -first, -second]))
-    without = accelerations(link_accelerations, linkage, state, np.zeros(4))
+        linkage, state, np.array([first, second, -first, -second]))
+    without = accelerations(linkage, state, np.zeros(4))
     # Rounding of tau / I, about 1 N m over the smallest 0.006 kg m^2 of the draw.
     np.testing.assert_allclose(with_torques, without, rtol=0.0, atol=1e-15 / 0.006 / 0.3**2)

@@ -224,3 +224,148 @@ def test_constants_are_worked_out_once() -> None:
 
 def test_total_mass_is_that_of_the_four_links() -> None:
     assert Mechanism(**described()).constants.total_mass == pytest.approx(0.09, rel=1e-15)
+
+
+@pytest.mark.parametrize(('changes', 'message'), [
+    ({'joint_stiffness': [1e4, 1e4, np.inf, 1e4]},
+     'joint_stiffness of joint 3 is infinite and that of joint 1 is not: give all four, or none'),
+    ({'joint_stiffness': [np.inf, np.inf, 1e4, np.inf]},
+     'joint_stiffness of joint 1 is infinite and that of joint 3 is not: give all four, or none'),
+    ({'joint_stiffness': [1e4, 0.0, 1e4, 1e4]},
+     'joint_stiffness of joint 2 must be positive, got 0'),
+    ({'joint_stiffness': [-1e4, 1e4, 1e4, 1e4]},
+     'joint_stiffness of joint 1 must be positive, got -10000'),
+    ({'joint_stiffness': [1e4, 1e4, 1e4, np.nan]},
+     'joint_stiffness of joint 4 must be finite, got nan'),
+    ({'joint_stiffness': [-np.inf] * 4}, 'joint_stiffness of joint 1 must be finite, got -inf'),
+    ({'joint_stiffness': 1e4}, 'joint_stiffness must have shape (4,), got ()'),
+    ({'motor_time_constants': [0.0, -1e-3, 0.0, 0.0]},
+     'motor_time_constants of link_b must not be negative, got -0.001'),
+    ({'motor_resistances': [0.0, 0.0, np.inf, 0.0]},
+     'motor_resistances of link_c must be finite, got inf'),
+    ({'motor_voltages': [np.inf, 12.0, np.inf, np.inf]},
+     'motor_resistances or motor_voltages of link_b is given: give motor_torque_constants too'),
+    ({'motor_resistances': [0.0, 0.0, 1.0, 0.0]},
+     'motor_resistances or motor_voltages of link_c is given: give motor_torque_constants too'),
+    ({'motor_voltages': [12.0] * 4, 'motor_torque_constants': [0.03] * 4},
+     'motor_voltages of link_a is given: give motor_resistances too'),
+    ({'motor_torque_constants': [0.0, 1.0, 1.0, 1.0]},
+     'motor_torque_constants of link_a must be positive, got 0'),
+    ({'motor_voltages': [12.0, 12.0, 12.0, np.nan]},
+     'motor_voltages of link_d must be finite, got nan'),
+    ({'joint_stiffness': [1e4] * 4, 'joint_damping': [0.0, 0.0, -1.0, 0.0]},
+     'joint_damping of joint 3 must not be negative, got -1'),
+    ({'joint_stiffness': [1e4] * 4, 'joint_damping': [0.0, np.inf, 0.0, 0.0]},
+     'joint_damping of joint 2 must be finite, got inf'),
+    ({'joint_stiffness': [1e4] * 4, 'joint_damping': [1.0] * 3},
+     'joint_damping must have shape (4,), got (3,)'),
+    ({'joint_damping': [0.0, 1.0, 0.0, 0.0]},
+     'joint_damping of joint 2 is given, but the joints are rigid: give joint_stiffness too'),
+])
+def test_impossible_joints_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(MechanismError) as refusal:
+        Mechanism(**described(**changes))
+    assert str(refusal.value) == message
+
+
+@pytest.mark.parametrize('damping', [None, [0.0] * 4])
+def test_rigid_joints_may_be_told_too(damping: list[float] | None) -> None:
+    given = {} if damping is None else {'joint_damping': damping}
+    assert not Mechanism(**described(joint_stiffness=[np.inf] * 4, **given)).constants.compliant
+
+
+def test_joints_that_give_need_no_damping() -> None:
+    mechanism = Mechanism(**described(joint_stiffness=[1e4, 2e4, 3e4, 4e4]))
+    np.testing.assert_array_equal(mechanism.joint_damping, [0.0] * 4)
+    np.testing.assert_array_equal(mechanism.constants.joint_stiffness, [1e4, 2e4, 3e4, 4e4])
+
+
+def test_joints_are_read_from_a_file_and_refused_with_it(tmp_path: Path) -> None:
+    file = tmp_path / 'bench.yaml'
+
+    def describe(stiffness: str) -> None:
+        values = {**described(), 'joint_stiffness': stiffness}
+        file.write_text('\n'.join(f'{name}: {value}' for name, value in values.items()))
+
+    describe('[10000.0, 20000.0, 30000.0, 40000.0]')
+    np.testing.assert_array_equal(
+        load_mechanism(str(file)).joint_stiffness, [1e4, 2e4, 3e4, 4e4])
+    describe('[10000.0, 20000.0, 0.0, 40000.0]')
+    with pytest.raises(MechanismError, match='bench.yaml: joint_stiffness of joint 3 must be pos'):
+        load_mechanism(str(file))
+
+
+def test_rigid_joints_leave_everything_else() -> None:
+    soft = Mechanism(**described(joint_stiffness=[1e4] * 4, joint_damping=[1.0] * 4))
+    rigid = soft.with_rigid_joints()
+    for name, value in described().items():
+        np.testing.assert_array_equal(getattr(rigid, name), value, err_msg=name)
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_no_joint_moves_faster_than_the_bound(seed: int) -> None:
+    """
+    The frequencies of four bodies on springs, and the decay rates of dampers alone.
+
+    Linear motion about a loop that is nearly closed, from the forces that a unit displacement of
+    each coordinate makes in every joint; by numpy's eigenvalues.
+    """
+    rng = np.random.default_rng(seed)
+    stiffness, damping = 10.0**rng.uniform(2.0, 6.0, 4), 10.0**rng.uniform(-2.0, 2.0, 4)
+    mechanism = Mechanism(**described(joint_stiffness=stiffness, joint_damping=damping))
+    turn = np.exp(1j * rng.uniform(-np.pi, np.pi, 4))
+    lengths, centres = mechanism.link_lengths, mechanism.com_positions @ [1.0, 1j]
+    # Rows: x and y of each joint; columns: x, y and angle of each body.
+    opening = np.zeros((8, 12))
+    for joint, (first, second) in enumerate((
+            ((0, 0.0), (1, 0.0)), ((1, lengths[1]), (2, 0.0)),
+            ((3, lengths[3]), (2, lengths[2])), ((0, lengths[0]), (3, 0.0)))):
+        for (link, along), sign in ((first, -1.0), (second, 1.0)):
+            arm = 1j * turn[link] * (along - centres[link])
+            opening[2 * joint:2 * joint + 2, 3 * link:3 * link + 2] = sign * np.eye(2)
+            opening[2 * joint:2 * joint + 2, 3 * link + 2] = sign * arm.real, sign * arm.imag
+    inertia = np.column_stack(
+        [mechanism.link_masses, mechanism.link_masses, mechanism.link_inertias]).ravel()
+    fastest = []
+    for weight in (stiffness, damping):
+        scaled = np.sqrt(np.repeat(weight, 2))[:, np.newaxis] * opening / np.sqrt(inertia)
+        fastest.append(np.linalg.norm(scaled, 2)**2)
+    bound = mechanism.constants.fastest_joint_mode
+    assert max(np.sqrt(fastest[0]), fastest[1]) <= bound
+    # Gershgorin's discs of eight rows: at most that much too careful.
+    assert bound <= 8.0 * max(np.sqrt(fastest[0]), fastest[1])
+
+
+def test_joints_are_rigid_unless_told() -> None:
+    rigid = Mechanism(**described())
+    soft = Mechanism(**described(joint_stiffness=[1e4] * 4, joint_damping=[1.0] * 4))
+    assert not rigid.constants.compliant
+    assert soft.constants.compliant
+    assert not soft.with_rigid_joints().constants.compliant
+
+
+def test_prescribed_wheels_turn_with_their_links() -> None:
+    """Their axial inertia counts as that of the link, the others' does not."""
+    mechanism = Mechanism(**described())
+    given = np.array([True, False, False, True])
+    added = np.diag(mechanism.constants_with(given).cosine - mechanism.constants.cosine)
+    np.testing.assert_allclose(
+        added, np.where(given, mechanism.flywheel_inertias, 0.0), rtol=0.0, atol=1e-18)
+
+
+@pytest.mark.parametrize('signs', [(1, -1, -1, 1), (1, 1, -1, -1), (1, -1, 1, -1)])
+def test_lengths_that_almost_meet_a_change_point_are_made_to_meet_it(
+    signs: tuple[int, ...],
+) -> None:
+    """Within 1e-8 of their mean; those that miss it by more keep their values."""
+    lengths = np.array([0.12, 0.1, 0.14, 0.09])
+    lengths -= np.dot(signs, lengths) / 4.0 * np.array(signs)
+    one = np.array([0.0, 0.0, lengths.mean(), 0.0])
+    for mismatch in (9e-9, -1e-12):
+        almost = lengths + mismatch * one
+        matched = Mechanism(**described(link_lengths=almost)).link_lengths
+        assert abs(np.dot(signs, matched)) < 1e-16
+        np.testing.assert_allclose(matched, almost, rtol=0.0, atol=1e-8 * 0.1)
+    missed = lengths + 1.1e-8 * one
+    np.testing.assert_array_equal(
+        Mechanism(**described(link_lengths=missed)).link_lengths, missed)

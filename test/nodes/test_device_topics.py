@@ -14,8 +14,9 @@
 
 """Every topic and service of the three nodes: type, quality of service, names, arrays."""
 
-from math import pi
+from math import atan2, cos, pi, sin
 
+from nav_msgs.msg import Odometry
 import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
@@ -34,10 +35,19 @@ JOINT_STATES = {
         'timing': (['round_trip_s', 'command_age_s', 'lost', 'step_s'], ('position',)),
         'sim/link_states': (LINKS, ANGLE_AND_RATE),
         'sim/flywheel_states': (WHEELS, ALL),
+        'sim/ledger': ([
+            'links_j', 'wheels_j', 'springs_j', 'supplied_j', 'tilt_j', 'disturbance_j',
+            'copper_j', 'bearings_j', 'joints_j', 'drag_j', 'edge_j', 'unaccounted_j',
+            'links_spin_n_m_s', 'wheels_spin_n_m_s', 'drag_spin_n_m_s', 'edge_spin_n_m_s',
+            'disturbance_spin_n_m_s', 'unaccounted_spin_n_m_s', 'contacts'], ('position',)),
     },
     'estimator': {
         'estimate/link_states': (LINKS, ANGLE_AND_RATE),
         'estimate/sigma': (LINKS, ANGLE_AND_RATE),
+        'estimate/covariance': ([
+            'phi_a.phi_a', 'phi_a.phi_b', 'phi_a.omega_a', 'phi_a.omega_b', 'phi_b.phi_b',
+            'phi_b.omega_a', 'phi_b.omega_b', 'omega_a.omega_a', 'omega_a.omega_b',
+            'omega_b.omega_b'], ('position',)),
         'estimate/innovation': (['nis', 'degrees_of_freedom', *LINKS], ('position',)),
     },
     'controller': {
@@ -58,9 +68,11 @@ SUBSCRIPTIONS = {
                    'device_status': True},
 }
 SERVICES = {
-    'plant': {'/arm': 'std_srvs/srv/SetBool', '/emergency_stop': 'std_srvs/srv/Trigger',
+    'plant': {'/sim/pause': 'std_srvs/srv/SetBool', '/sim/step': 'std_srvs/srv/Trigger',
+              '/sim/reset': 'std_srvs/srv/Trigger', '/arm': 'std_srvs/srv/SetBool',
+              '/emergency_stop': 'std_srvs/srv/Trigger',
               '/reset_emergency_stop': 'std_srvs/srv/Trigger'},
-    'estimator': {},
+    'estimator': {'/estimate/reset': 'std_srvs/srv/Trigger'},
     'controller': {},
 }
 JOINT_STATE, STATUS = 'sensor_msgs/msg/JointState', 'diagnostic_msgs/msg/DiagnosticStatus'
@@ -68,6 +80,10 @@ JOINT_STATE, STATUS = 'sensor_msgs/msg/JointState', 'diagnostic_msgs/msg/Diagnos
 OF_ROS = {'/rosout', '/parameter_events'}
 
 each_node = pytest.mark.parametrize('name', list(JOINT_STATES))
+
+
+def stamp_of(message):
+    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
 
 @pytest.fixture(scope='module')
@@ -81,6 +97,12 @@ def testbed(module_suite, probe):
     return probe
 
 
+@pytest.fixture(autouse=True)
+def all_topics_are_not_followed_at_once(testbed):
+    """Twelve of them take as much of the machine as the nodes do."""
+    testbed.unfollow()
+
+
 def types_by_name(pairs):
     return {name: types[0] for name, types in pairs if name not in OF_ROS}
 
@@ -91,6 +113,10 @@ def test_node_publishes_just_its_topics(testbed, name):
     expected['/diagnostics'] = 'diagnostic_msgs/msg/DiagnosticArray'
     if name in STATUSES:
         expected[f'/{STATUSES[name]}'] = STATUS
+    if name == 'plant':
+        expected['/sim/odometry'] = 'nav_msgs/msg/Odometry'
+    if name == 'estimator':
+        expected['/estimate/waiting'] = 'std_msgs/msg/Header'
     found = testbed.node.get_publisher_names_and_types_by_node(name, '/')
     assert types_by_name(found) == expected
 
@@ -228,3 +254,28 @@ def test_late_joiner_gets_both_statuses(testbed, make_probe):
     testbed.arm(False)
     testbed.status('device_status', state='disarmed')
     assert float(armed['since']) > 1e9
+
+
+def test_odometry_is_that_of_link_a(testbed):
+    """Orientation of link a; while nothing moves the mass centre, joint 1 turns about it."""
+    odometry = testbed.follow('sim/odometry', kind=Odometry)
+    testbed.wait(lambda: len(odometry) > 50)
+    testbed.follow('sim/link_states')
+    testbed.more('sim/link_states', 20)
+    truth = {stamp_of(message): message for message in testbed.received['sim/link_states']}
+    message = testbed.wait(lambda: next(
+        (one for one in reversed(odometry) if stamp_of(one) in truth), None))
+    assert (message.header.frame_id, message.child_frame_id) == ('table', 'link_a')
+    link = truth[stamp_of(message)]
+    angle = link.position[0]
+    orientation = message.pose.pose.orientation
+    assert 2.0 * atan2(orientation.z, orientation.w) == pytest.approx(angle, abs=1e-9)
+    # The mass centre of the rhombus stays in the origin; joint 1 is half a link a and half a link
+    # b away from it.
+    place = message.pose.pose.position
+    other = link.position[1]
+    assert [place.x, place.y] == pytest.approx(
+        [-0.05 * (cos(angle) + cos(other)), -0.05 * (sin(angle) + sin(other))], abs=1e-9)
+    assert message.twist.twist.angular.z == link.velocity[0]
+    testbed.node.destroy_subscription(next(
+        one for one in testbed.node.subscriptions if one.topic_name.endswith('odometry')))

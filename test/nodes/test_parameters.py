@@ -90,7 +90,9 @@ def set_value(probe, node, name, value):
 
 @pytest.fixture(scope='module')
 def testbed(module_suite, probe):
-    module_suite.nodes()
+    """Start the nodes with nothing but their defaults."""
+    for node in TABLES:
+        module_suite.start(node)
     probe.follow('tracking_error', 'flywheel_command', 'reference')
     probe.newest('flywheel_command')
     return probe

@@ -68,6 +68,9 @@ def testbed(started):
     """Arm; the controller holds, and takes the place where it is for its goal."""
     started.wait(lambda: started.arm().success)
     started.status('controller_status', mode='hold')
+    # What was under way before that follows the noisy estimate.
+    held = started.received['reference']
+    started.wait(lambda: len(held) > 1 and held[-1].position == held[-2].position)
     yield started
     started.arm(False)
     started.status('controller_status', mode='disarmed')

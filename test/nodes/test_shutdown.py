@@ -14,7 +14,11 @@
 
 """Every node ends when it is asked to: quickly, silently, and with the wheels let go."""
 
+from pathlib import Path
 import signal
+import subprocess
+import sys
+import time
 
 import pytest
 from sensor_msgs.msg import JointState
@@ -86,3 +90,45 @@ def test_signal_during_the_start_is_no_outcry(suite, make_probe):
     process.send(signal.SIGINT)
     assert process.end(seconds=SHUTDOWN_S) == 0
     process.check_clean()
+
+
+# Runs a command, and tells which threads the middleware has when ROS has ended.
+WATCHED = """
+import os, sys
+from fourbar_ros.nodes import runtime
+from fourbar_ros.commands.main import main
+end = runtime.Runtime.shut_down
+def shut_down(self, *args):
+    end(self, *args)
+    names = [open(f'/proc/self/task/{task}/comm').read().strip()
+             for task in os.listdir('/proc/self/task')]
+    print('threads', *(name for name in names if name.startswith('dds.')), flush=True)
+runtime.Runtime.shut_down = shut_down
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize('sim_time', [False, True], ids=['', 'sim_time'])
+@pytest.mark.parametrize('name', ['plant', 'estimator', 'controller', 'record'])
+def test_nothing_of_the_middleware_is_left_to_the_end_of_the_process(
+        domain, shared_memory, tmp_path, name, sim_time):
+    """There it waits for its own callbacks, now and then for ever, at full speed."""
+    arguments = ['--ros-args', '-p', f'use_sim_time:={str(sim_time).lower()}']
+    if name == 'record':
+        arguments = ['-o', 'bag']
+    process = subprocess.Popen(
+        [sys.executable, '-c', WATCHED, name, *arguments], cwd=tmp_path,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # The middleware makes its threads before the node takes signals.
+    deadline = time.monotonic() + 20.0
+    while b'dds.' not in b''.join(
+            path.read_bytes() for path in Path(f'/proc/{process.pid}/task').glob('*/comm')):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    shared_memory.note(process.pid)
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=20.0)
+    line, = [line for line in out.splitlines() if line.startswith('threads')]
+    # This one belongs to the process.
+    assert set(line.split()[1:]) <= {'dds.shm.wdog'}

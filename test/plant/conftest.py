@@ -18,12 +18,13 @@ from collections.abc import Callable
 
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.plant import InitialState, Plant, Table
-from fourbar_ros.plant.table import LinkSensors, WheelEncoders
+from fourbar_ros.plant.sensors import LinkSensorSettings
+from fourbar_ros.plant.table import WheelEncoders
 import numpy as np
 import pytest
 
 AT_REST = InitialState()
-PERFECT = Table(LinkSensors(0.0, 0), WheelEncoders(0))
+PERFECT = Table(LinkSensorSettings(), WheelEncoders(0))
 
 
 @pytest.fixture(scope='session')

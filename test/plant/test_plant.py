@@ -26,13 +26,13 @@ from fourbar_ros.mechanism import (
     Mechanism,
 )
 from fourbar_ros.plant import InitialState, Plant, PlantError, Table, Truth
-from fourbar_ros.plant.table import LinkSensors, WheelEncoders
+from fourbar_ros.plant.sensors import LinkSensorSettings
+from fourbar_ros.plant.table import WheelEncoders
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.typing import NDArray
 import pytest
-from scipy import stats
 
 Array = NDArray[np.float64]
 MakePlant = Callable[..., Plant]
@@ -188,63 +188,30 @@ def test_truth_is_a_copy(make_plant: MakePlant) -> None:
     assert not plant.truth().efforts.any()
 
 
-def sensed(plant: Plant, count: int) -> Array:
-    """Return the errors (count, 4) of the link sensors at rest."""
-    truth = plant.truth().link_angles
-    errors = np.array([plant.sense_links() for _ in range(count)]) - truth
-    return (errors + pi) % (2.0 * pi) - pi
-
-
-@pytest.fixture(scope='module')
-def noise(make_plant: MakePlant) -> Array:
-    """Sample the noise (4000, 4) of the link sensors, in units of its rms; seed 3."""
-    rms = 2e-3
-    table = Table(LinkSensors(rms, 0), WheelEncoders(0))
-    return sensed(make_plant(table=table, seed=3), 4000) / rms
-
-
-def test_noise_has_the_rms_asked_for(noise: Array) -> None:
-    for errors in noise.T:
-        low, high = stats.chi2.interval(CONFIDENCE, errors.size)
-        assert low < float(errors @ errors) < high
-        assert abs(errors.mean()) * np.sqrt(errors.size) < stats.norm.interval(CONFIDENCE)[1]
-
-
-def test_noise_is_white_and_each_sensor_has_its_own(noise: Array) -> None:
-    """No correlation in time up to 20 samples, and none between two sensors."""
-    bound = stats.norm.interval(1.0 - (1.0 - CONFIDENCE) / (16 * 20 + 6))[1]
-    for lag in range(21):
-        later, earlier = noise[lag:], noise[:len(noise) - lag]
-        correlations = later.T @ earlier / np.sqrt(len(later))
-        if lag == 0:
-            correlations = correlations[np.triu_indices(4, 1)]
-        assert np.abs(correlations).max() < bound, f'lag {lag}'
-
-
 @pytest.mark.parametrize('counts', [4, 1000, 16384])
 def test_samples_sit_on_the_grid_of_the_resolution(counts: int, make_plant: MakePlant) -> None:
     step = 2.0 * pi / counts
-    plant = make_plant(table=Table(LinkSensors(0.0, counts), WheelEncoders(counts)),
+    plant = make_plant(table=Table(LinkSensorSettings(), WheelEncoders(counts)),
                        initial=InitialState(0.7, 2.0, 'open', 1.0, 0.3))
     plant.advance(321, TORQUES)
+    samples, errors = plant.sense_wheels(), plant.sense_wheels() - plant.truth().wheel_angles
+    np.testing.assert_allclose(samples / step, np.round(samples / step), atol=1e-9)
+    assert (np.abs(errors) <= step / 2.0 * (1 + 1e-9)).all()
+
+
+def test_link_sensors_see_the_links(make_plant: MakePlant) -> None:
+    """Without errors they tell orientations and rates, in one turn."""
+    gyros = LinkSensorSettings(gyro=True)
+    plant = make_plant(table=Table(gyros, WheelEncoders(0)),
+                       initial=InitialState(9.7, 11.0, 'open', 1.0, 0.3))
+    plant.advance(321, TORQUES)
+    plant.measure_links(5)
+    reading, = plant.link_sensors.due(5)
     truth = plant.truth()
-    wrapped = np.angle(np.exp(1j * (plant.sense_links() - truth.link_angles)))
-    for samples, errors in ((plant.sense_links(), wrapped),
-                            (plant.sense_wheels(), plant.sense_wheels() - truth.wheel_angles)):
-        np.testing.assert_allclose(samples / step, np.round(samples / step), atol=1e-9)
-        assert (np.abs(errors) <= step / 2.0 * (1 + 1e-9)).all()
-
-
-@pytest.mark.parametrize('counts', [0, 16384])
-@pytest.mark.parametrize('link_a', [pi, -pi, 5.0 * pi])
-def test_samples_lie_in_one_turn(link_a: float, counts: int, make_plant: MakePlant) -> None:
-    """On the cut itself noise falls to either side, but never outside (-pi, pi]."""
-    plant = make_plant(table=Table(LinkSensors(1e-3, counts), WheelEncoders(0)),
-                       initial=InitialState(link_a, link_a + 1.0))
-    samples = np.array([plant.sense_links() for _ in range(400)])
-    assert ((samples > -pi) & (samples <= pi)).all()
-    assert (samples[:, 0] > 3.0).any()
-    assert (samples[:, 0] < -3.0).any()
+    np.testing.assert_allclose(
+        reading.angles, np.angle(np.exp(1j * truth.link_angles)), rtol=0.0, atol=1e-12)
+    assert reading.rates.tolist() == truth.link_rates.tolist()
+    assert reading.names == ('link_a', 'link_b', 'link_c', 'link_d')
 
 
 def test_wheel_encoders_count_turns(make_plant: MakePlant) -> None:
@@ -256,14 +223,16 @@ def test_wheel_encoders_count_turns(make_plant: MakePlant) -> None:
 
 def record(plant: Plant) -> bytes:
     samples = []
-    for _ in range(20):
+    for stamp_ns in range(20):
         plant.advance(8, TORQUES)
-        samples += [plant.sense_links(), plant.sense_wheels(), plant.truth().link_rates]
+        plant.measure_links(stamp_ns)
+        reading, = plant.link_sensors.due(stamp_ns)
+        samples += [reading.angles, plant.sense_wheels(), plant.truth().link_rates]
     return np.array(samples).tobytes()
 
 
 def test_same_seed_same_bytes(make_plant: MakePlant) -> None:
-    table = Table(LinkSensors(1e-3, 16384), WheelEncoders(16384))
+    table = Table(LinkSensorSettings(noise_rms=1e-3, counts_per_turn=16384), WheelEncoders(16384))
     assert record(make_plant(table=table, seed=7)) == record(make_plant(table=table, seed=7))
     assert record(make_plant(table=table, seed=7)) != record(make_plant(table=table, seed=8))
 

@@ -1,0 +1,30 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The linkage by other people's means, to hold ours against.
+
+Nothing here uses the equations of `fourbar_ros.mechanism`, only its parameters and conventions.
+"""
+
+from importlib import import_module
+
+
+def installed(library: str) -> bool:
+    """Tell whether an engine's library can be imported here."""
+    try:
+        import_module(library)
+    except ImportError:
+        return False
+    return True

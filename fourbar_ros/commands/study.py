@@ -1,0 +1,79 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""`fourbar study`: rerun a study of the paper and check what comes out."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+import json
+from pathlib import Path
+import sys
+
+from fourbar_ros.analysis.studies import load_study, STUDIES
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    known = '\n'.join(f'  {name:<12}{text}' for name, text in STUDIES.items())
+    parser.epilog = (f'studies:\n{known}\n\n'
+                     'Exits with 0 when every check is kept, with 1 when one is missed.')
+    parser.add_argument('name', metavar='NAME', help='which study')
+    parser.add_argument(
+        '-o', '--output', metavar='FOLDER', type=Path,
+        help='where figures and tables go (made if missing, default study_NAME)')
+    parser.add_argument(
+        '--json', metavar='FILE', type=Path,
+        help='checks and numbers, units in their names (also in FOLDER as NAME.json)')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the study, print and write what it found."""
+    from fourbar_ros.analysis.checks import checks_as_json, print_checks
+    from fourbar_ros.commands.files import OutputError, write_whole
+    from fourbar_ros.commands.progress import show_progress
+    from fourbar_ros.mechanism.compiled import announced
+
+    study = load_study(args.name)
+    # Before the work, not after it.
+    folder = args.output or Path(f'study_{args.name}')
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f'cannot make {folder}: {error.strerror}') from None
+    if args.json and not args.json.absolute().parent.is_dir():
+        raise OutputError(f'cannot write {args.json}: no such folder')
+
+    with announced():
+        result = study(show_progress)
+    document = {'study': args.name, 'checks': checks_as_json(result.checks),
+                'skipped': list(result.skipped), **result.data}
+    text = json.dumps(document, indent=2, allow_nan=False) + '\n'
+    files: Mapping[Path, str | bytes] = {
+        **{folder / name: content for name, content in result.files.items()},
+        folder / f'{args.name}.json': text, **({args.json: text} if args.json else {})}
+    for path, content in files.items():
+        with write_whole(path) as file:
+            if isinstance(content, bytes):
+                file.buffer.write(content)
+            else:
+                file.write(content)
+
+    print(result.text)
+    print_checks(result.checks)
+    print('\n'.join(str(path) for path in files))
+    for reason in result.skipped:
+        print(f'fourbar study: {reason}', file=sys.stderr)
+    return 0 if all(check.passed for check in result.checks) else 1

@@ -1,0 +1,116 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What is wrong with a sensor, as far as its samples tell.
+
+A sensor that gives nothing or loses samples, one that repeats one value, and one whose samples the
+gate refuses. A frozen sample fits a filter better than a noisy one, so no test of innovations
+finds it while the linkage rests: that it is the same bit for bit does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fourbar_ros.mechanism import SENSOR_NAMES
+
+# A sensor without a sample for so long gives no data [ns].
+SILENT_AFTER_NS = 200_000_000
+
+# So many equal samples in a row mean that a sensor is stuck, if each of the others has changed
+# within so many: then there is noise, and it should be in this one, too.
+STUCK_AFTER = 50
+LIVELY = 10
+
+# The samples of a sensor are far off when the gate refuses more than this share of them, over the
+# last so many. It refuses some of a healthy one, too.
+REFUSED_SHARE = 0.2
+REFUSED_OVER = 25
+
+# A sensor loses samples when the time between two of them is on the mean so many times its least,
+# over the last so many; a gap counts as this much at the most, since silence is another matter.
+GAPPY, GAPS_OVER, LONGEST_GAP = 1.25, 50, 3.0
+
+SILENT, STUCK, FAR_OFF = 'no data', 'repeats one value', 'samples far off'
+LOSES = 'loses samples'
+
+
+class SensorHealth:
+    """Watches the samples of all sensors; those that never gave one do not count."""
+
+    def __init__(self) -> None:
+        count = len(SENSOR_NAMES)
+        self._newest_ns: list[int | None] = [None] * count
+        self._value = [0.0] * count
+        self._equal = [0] * count
+        self._refused = [0.0] * count
+        self._least_gap_ns: list[int | None] = [None] * count
+        self._gap = [1.0] * count
+
+    def sample(self, stamp_ns: int, sensor: int, angle: float) -> None:
+        """
+        Take note of a sample.
+
+        :param stamp_ns: time of measurement [ns].
+        :param sensor: index of `SENSOR_NAMES`.
+        :param angle: as it came [rad].
+        """
+        newest_ns = self._newest_ns[sensor]
+        if newest_ns is None or angle != self._value[sensor]:
+            self._value[sensor], self._equal[sensor] = angle, 1
+        else:
+            self._equal[sensor] += 1
+        if newest_ns is None:
+            self._newest_ns[sensor] = stamp_ns
+        elif stamp_ns > newest_ns:
+            self._newest_ns[sensor] = stamp_ns
+            self._note_gap(sensor, stamp_ns - newest_ns)
+
+    def _note_gap(self, sensor: int, gap_ns: int) -> None:
+        least_ns = self._least_gap_ns[sensor]
+        if least_ns is None or gap_ns < least_ns:
+            self._least_gap_ns[sensor] = least_ns = gap_ns
+        self._gap[sensor] += (min(gap_ns / least_ns, LONGEST_GAP) - self._gap[sensor]) / GAPS_OVER
+
+    def judged(self, sensors: Sequence[int], used: Sequence[bool]) -> None:
+        """Take note of what the gate made of some samples."""
+        for sensor, taken in zip(sensors, used):
+            self._refused[sensor] += ((not taken) - self._refused[sensor]) / REFUSED_OVER
+
+    def stuck(self, sensor: int) -> bool:
+        """
+        Tell whether a sensor repeats one value while all the others do not.
+
+        Where more of them repeat theirs, links rest under sensors without noise.
+        """
+        return self._equal[sensor] >= STUCK_AFTER and all(
+            equal < LIVELY for other, equal in enumerate(self._equal) if other != sensor)
+
+    def faults(self, now_ns: int) -> dict[str, str]:
+        """Tell what is wrong now [ns]: a few words by the name of the sensor."""
+        found = {}
+        for sensor, name in enumerate(SENSOR_NAMES):
+            newest_ns = self._newest_ns[sensor]
+            if newest_ns is None:
+                continue
+            if now_ns - newest_ns > SILENT_AFTER_NS:
+                found[name] = SILENT
+            elif self.stuck(sensor):
+                found[name] = STUCK
+            elif self._refused[sensor] > REFUSED_SHARE:
+                found[name] = FAR_OFF
+            elif self._gap[sensor] > GAPPY:
+                found[name] = LOSES
+        return found

@@ -1,0 +1,100 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Run a scenario in one process, without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+
+from fourbar_ros.control import Controller, SetpointError
+from fourbar_ros.device import SimulatedTable, Testbed, TestbedSettings
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.estimation import Estimator
+from fourbar_ros.loop.closed_loop import ClosedLoop, Step
+from fourbar_ros.loop.recording import Recording
+from fourbar_ros.loop.scenario import Scenario
+from fourbar_ros.plant import Plant
+import numpy as np
+
+
+class RunError(FourbarError):
+    """A scenario whose script did not go as it is written."""
+
+
+def make_loop(scenario: Scenario) -> ClosedLoop:
+    """
+    Make the closed loop that a scenario describes, at rest before its first tick.
+
+    :raises PlantError: the control period is not a whole multiple of the plant step, or the
+        linkage cannot start as described.
+    """
+    settings = scenario.plant
+    plant = Plant(scenario.mechanism, scenario.table, scenario.initial, settings.step,
+                  np.random.default_rng(scenario.seed))
+    testbed = Testbed(SimulatedTable(plant, settings.period_ns), TestbedSettings(
+        settings.command_timeout, settings.sensor_timeout, settings.timeout_action))
+    return ClosedLoop(testbed, Estimator(scenario.mechanism, scenario.estimator),
+                      Controller(scenario.mechanism, scenario.controller))
+
+
+def run_scenario(scenario: Scenario) -> Iterator[Step]:
+    """
+    Go through a scenario tick by tick.
+
+    What the script does at a time happens right after the first tick at or after it, and acts
+    from the next tick on.
+
+    :raises RunError: the device refused to be armed, or the controller a setpoint.
+    :raises FourbarError: the device failed.
+    """
+    loop = make_loop(scenario)
+    waiting = list(scenario.setpoints)
+    for tick in range(scenario.ticks):
+        step = loop.step()
+        if scenario.arm_at is not None and tick == scenario.tick_at(scenario.arm_at):
+            armed, reason = loop.arm()
+            if not armed:
+                raise RunError(f'arm_at {scenario.arm_at:g} s: {reason}')
+        while waiting and tick == scenario.tick_at(waiting[0].at):
+            setpoint = waiting.pop(0)
+            number = len(scenario.setpoints) - len(waiting)
+            loop.controller.settings = replace(
+                scenario.controller,
+                setpoint_duration=setpoint.duration or scenario.controller.setpoint_duration)
+            try:
+                loop.controller.setpoint(
+                    setpoint.names, setpoint.positions, step.samples.stamp_ns)
+            except SetpointError as error:
+                raise RunError(f'setpoints, entry {number} at {setpoint.at:g} s, refused: {error}'
+                               ) from None
+        yield step
+
+
+def record_run(scenario: Scenario, watch: Callable[[Iterable[Step], int], Iterable[Step]] | None
+               = None) -> Recording:
+    """
+    Run a scenario and keep everything that the nodes would publish.
+
+    :param watch: is given the steps and their number, and hands them on.
+    :raises FourbarError: as :func:`run_scenario`.
+    """
+    recording = Recording(scenario.table.link_sensors.sensor_names)
+    steps: Iterable[Step] = run_scenario(scenario)
+    if watch is not None:
+        steps = watch(steps, scenario.ticks)
+    for step in steps:
+        recording.add(step)
+    return recording

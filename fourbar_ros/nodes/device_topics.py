@@ -1,0 +1,92 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a device says at every tick, and when its gate changes."""
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from fourbar_ros.device.gate import DeviceState
+from fourbar_ros.mechanism import FLYWHEEL_NAMES
+from fourbar_ros.nodes.messages import (
+    ERROR,
+    JointStatePublisher,
+    LATCHED,
+    OK,
+    status_message,
+    TABLE_FRAME,
+)
+
+LEVELS = {DeviceState.DISARMED: OK, DeviceState.ARMED: OK,
+          DeviceState.EMERGENCY_STOP: ERROR, DeviceState.FAULT: ERROR}
+TIMING_NAMES = ('round_trip_s', 'command_age_s', 'lost', 'step_s')
+
+
+class DeviceTopics:
+    """
+    Publish samples, timing and the state of the gate.
+
+    :param mechanism: name of it, for people.
+    """
+
+    def __init__(self, node, testbed, mechanism):
+        self._node = node
+        self._gate = testbed.gate
+        self._device = device = testbed.device
+        self._mechanism = mechanism
+        self._announced = None
+        self._links = JointStatePublisher(
+            node, 'link_angles', device.sensor_names,
+            ('position', 'velocity') if device.measures_rates else ('position',),
+            frame=TABLE_FRAME)
+        self._wheels = JointStatePublisher(
+            node, 'flywheel_states', FLYWHEEL_NAMES, ('position', 'velocity', 'effort'))
+        self._timing = JointStatePublisher(node, 'timing', TIMING_NAMES, ('position',))
+        self._status = node.create_publisher(DiagnosticStatus, 'device_status', LATCHED)
+
+    def publish_samples(self, samples):
+        """Publish what was measured; the tick comes after everything that belongs to it."""
+        self._samples = samples
+        self.send_again(links=True)
+
+    def send_again(self, links):
+        """
+        Send the last tick once more, as it was.
+
+        :param links: also the link angles that belong to it.
+        """
+        samples = self._samples
+        for sample in samples.links if links else ():
+            self._links.publish(sample.stamp_ns, sample.angles, sample.rates, names=sample.names)
+        wheels = samples.wheels
+        self._wheels.publish(samples.stamp_ns, wheels.angles, wheels.speeds, wheels.efforts)
+
+    def publish_timing(self, stamp_ns, timing):
+        """Publish what is known of how the loop keeps time."""
+        scalars = {name: getattr(timing, name) for name in TIMING_NAMES}
+        known = tuple(name for name in TIMING_NAMES if scalars[name] is not None)
+        self._timing.publish(stamp_ns, [scalars[name] for name in known], names=known)
+
+    def announce(self):
+        """Publish the gate's state if it changed; tell whether it did."""
+        gate = self._gate
+        present = gate.state, gate.reason, gate.since_ns
+        if present == self._announced:
+            return False
+        self._announced = present
+        self._status.publish(status_message(
+            self._node, self._device.description, LEVELS[gate.state],
+            f'{gate.state.value}: {gate.reason}', {
+                'state': gate.state.value, 'reason': gate.reason,
+                'since': f'{gate.since_ns * 1e-9:.9f}', 'mechanism': self._mechanism}))
+        self._node.get_logger().info(f'{gate.state.value}: {gate.reason}')
+        return True

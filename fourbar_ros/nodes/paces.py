@@ -1,0 +1,47 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The clocks that ticks may follow: each a pace, and how often to look at it."""
+
+import time
+
+from fourbar_ros.device import FastPace, LockstepPace, RealtimePace
+from fourbar_ros.nodes.messages import steady_ns
+
+# Up to this delay every tick is caught up with; after longer ones real time leaves them out and
+# fast time slows down [ns].
+PATIENCE_NS = 100_000_000
+
+# The shortest and the longest time between two looks at a clock [ns]; what is due in between is
+# caught up.
+SHORTEST_POLL_NS = 500_000
+LONGEST_POLL_NS = 50_000_000
+
+
+def realtime_pace(_values, period_ns):
+    """Make the pace of the real world, to be looked at once per period."""
+    return RealtimePace(time.time_ns(), steady_ns(), period_ns, PATIENCE_NS), period_ns
+
+
+def fast_pace(values, period_ns):
+    """Make the pace of simulated time that passes faster or slower."""
+    factor = values['real_time_factor']
+    poll_ns = round(period_ns / factor) if factor else 0
+    return (FastPace(steady_ns(), period_ns, factor, PATIENCE_NS),
+            max(SHORTEST_POLL_NS, min(poll_ns, LONGEST_POLL_NS)))
+
+
+def lockstep_pace(_values, period_ns):
+    """Make the pace of simulated time that waits for the answer to every tick."""
+    return LockstepPace(period_ns), LONGEST_POLL_NS

@@ -1,0 +1,203 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The flywheel motors: what torque they give, what their bearings take, what they lose.
+
+Within a step of the plant the torque is constant, at its mean; so impulse and work are exact.
+"""
+
+from __future__ import annotations
+
+from math import exp, inf, isnan
+
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.mechanism.constants import record
+from fourbar_ros.mechanism.forces import grip
+from fourbar_ros.plant.table import WheelBearings
+import numpy as np
+
+# Bandwidth of the loop in the motor's own electronics that follows a commanded speed [rad/s].
+SPEED_BANDWIDTH = 60.0
+
+# Newton's method converges in three or four rounds; more is a number that is not finite.
+MOST_ROUNDS = 60
+
+# Friction that takes a smaller share of the speed in one step is followed by the middle of it.
+GENTLE = 0.5
+
+FIELDS: list[tuple[str, type, tuple[int, ...]]] = [
+    ('torque_limit', float, (4,)),      # N m
+    ('speed_limit', float, (4,)),       # rad/s
+    ('time_constant', float, (4,)),     # s
+    ('torque_constant', float, (4,)),   # N m/A
+    ('resistance', float, (4,)),        # ohm
+    ('voltage', float, (4,)),           # V
+    ('inertia', float, (4,)),           # kg m^2, of the wheel
+    ('viscous', float, ()),             # N m s
+    ('coulomb', float, ()),             # N m
+    ('static_ratio', float, ()),
+    ('stribeck_speed', float, ()),      # rad/s
+    ('smoothing', float, ()),           # rad/s
+]
+
+Motors = np.record
+"""What the kernels need to know of motors and bearings, made by :func:`motors_of`."""
+
+
+def motors_of(mechanism: Mechanism, bearings: WheelBearings) -> Motors:
+    """Collect the parameters of the four motors and of the bearings of their wheels."""
+    return record(
+        FIELDS, torque_limit=mechanism.motor_torque_limits,
+        speed_limit=mechanism.motor_speed_limits, time_constant=mechanism.motor_time_constants,
+        torque_constant=mechanism.motor_torque_constants,
+        resistance=mechanism.motor_resistances, voltage=mechanism.motor_voltages,
+        inertia=mechanism.flywheel_inertias, viscous=bearings.viscous, coulomb=bearings.coulomb,
+        static_ratio=bearings.static_ratio, stribeck_speed=bearings.stribeck_speed,
+        smoothing=bearings.smoothing)
+
+
+@kernel
+def speed_loop(wheel: int, wanted: float, speed: float, integral: float, step: float,
+               motors: Motors) -> tuple[float, float]:
+    """
+    Follow a commanded wheel speed as the motor's electronics do (PI, critically damped).
+
+    :param wanted, speed: relative to the link [rad/s].
+    :param integral: part of the torque that the loop has learnt [N m], NaN at the beginning.
+    :returns: torque to ask for [N m], and the new integral, which stands still in the limit.
+    """
+    gain = SPEED_BANDWIDTH * motors.inertia[wheel]
+    error = wanted - speed
+    limit = motors.torque_limit[wheel]
+    if isnan(integral) or ((gain * error + integral) * error > 0.0
+                           and abs(gain * error + integral) >= limit):
+        # On the way in there is nothing to learn; from here the error dies out without overshoot.
+        integral = -0.5 * gain * error
+    torque = gain * error + integral
+    if abs(torque) < limit:
+        integral += 0.25 * SPEED_BANDWIDTH * gain * error * step
+    return min(max(torque, -limit), limit), integral
+
+
+@kernel
+def available_torque(wheel: int, asked: float, speed: float, motors: Motors) -> float:
+    """
+    Limit a torque to what the motor can give [N m].
+
+    That is its torque limit, what the supply voltage leaves beyond the back-EMF, and at the speed
+    limit nothing that would drive the wheel further into it.
+    """
+    limit = motors.torque_limit[wheel]
+    torque = min(max(asked, -limit), limit)
+    if motors.resistance[wheel] > 0.0 and motors.voltage[wheel] < inf:
+        constant = motors.torque_constant[wheel]
+        slope, back = constant / motors.resistance[wheel], constant * speed
+        torque = min(max(torque, slope * (-motors.voltage[wheel] - back)),
+                     slope * (motors.voltage[wheel] - back))
+    if abs(speed) >= motors.speed_limit[wheel] and torque * speed > 0.0:
+        torque = 0.0
+    return float(torque)
+
+
+@kernel
+def lagged_torque(wheel: int, torque: float, target: float, step: float, motors: Motors
+                  ) -> tuple[float, float]:
+    """
+    Let the torque follow its target for a step.
+
+    :returns: mean over the step and value at its end [N m].
+    """
+    time_constant = motors.time_constant[wheel]
+    if time_constant <= 0.0:
+        return target, target
+    left = exp(-step / time_constant)
+    mean = target + (torque - target) * time_constant / step * (1.0 - left)
+    return mean, target + (torque - target) * left
+
+
+@kernel
+def bearing_torque(speed: float, extra_coulomb: float, motors: Motors) -> float:
+    """
+    Evaluate the friction between a wheel and its link, which acts against `speed` [N m].
+
+    A function of the relative speed [rad/s] alone: viscous, Coulomb, and static friction that
+    falls off with speed.
+
+    :param extra_coulomb: beyond that of the bearing [N m].
+    """
+    dry = motors.coulomb * grip(
+        speed, motors.static_ratio, motors.stribeck_speed, motors.smoothing)
+    if extra_coulomb > 0.0:
+        dry += extra_coulomb * grip(speed, 1.0, 1.0, motors.smoothing)
+    return float((motors.viscous + dry) * speed)
+
+
+@kernel
+def friction_over_step(wheel: int, speed: float, torque: float, recoil: float,
+                       extra_coulomb: float, step: float, motors: Motors) -> float:
+    """
+    Find the friction torque that acts for a step [N m].
+
+    Friction at rest is so stiff that an explicit step would chatter. It is taken at the speed
+    that the wheel has in the middle of the step, or, where it changes too fast with speed for
+    that, at its end.
+
+    :param speed: of the wheel relative to the link [rad/s].
+    :param torque: of the motor [N m].
+    :param recoil: acceleration of the link [rad/s^2].
+    """
+    if motors.coulomb == 0.0 and motors.viscous == 0.0 and extra_coulomb == 0.0:
+        return 0.0
+    gain = step / motors.inertia[wheel]
+    drive = torque * gain - recoil * step
+    middle = _implicit_speed(speed + 0.5 * drive, 0.5 * gain, extra_coulomb, motors)
+    friction = bearing_torque(middle, extra_coulomb, motors)
+    end = speed + drive - gain * friction
+    slowest = min(abs(speed), abs(end)) if speed * end > 0.0 else 0.0
+    if gain * _friction_slope(slowest, extra_coulomb, motors) < GENTLE:
+        return friction
+    return bearing_torque(
+        _implicit_speed(speed + drive, gain, extra_coulomb, motors), extra_coulomb, motors)
+
+
+@kernel
+def _friction_slope(speed: float, extra_coulomb: float, motors: Motors) -> float:
+    """Estimate how fast friction grows with a speed that is not negative [N m s]."""
+    further = 1e-3 * (speed + 0.1 * motors.smoothing)
+    return float((bearing_torque(speed + further, extra_coulomb, motors)
+                  - bearing_torque(speed, extra_coulomb, motors)) / further)
+
+
+@kernel
+def _implicit_speed(free: float, gain: float, extra_coulomb: float, motors: Motors) -> float:
+    """Solve x + gain friction(x) = free; x lies between rest and free."""
+    size = abs(free)
+    low, high, x = 0.0, size, 0.0
+    for _ in range(MOST_ROUNDS):
+        friction = bearing_torque(x, extra_coulomb, motors)
+        rest = x + gain * friction - size
+        if rest < 0.0:
+            low = x
+        else:
+            high = x
+        after = x - rest / (1.0 + gain * _friction_slope(x, extra_coulomb, motors))
+        if not low <= after <= high:
+            after = 0.5 * (low + high)
+        if abs(after - x) <= 1e-14 * size:
+            x = after
+            break
+        x = after
+    return x if free >= 0.0 else -x

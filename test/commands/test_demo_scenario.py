@@ -1,0 +1,60 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the demo takes from a scenario, and which it refuses, without starting anything."""
+
+from pathlib import Path
+
+from fourbar_ros.commands.demo import _one_move, _write_parameters
+from fourbar_ros.configuration import share_directory
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.loop import load_scenario
+import pytest
+import yaml
+
+
+@pytest.mark.parametrize('name', ['paper', 'prototype'])
+def test_nodes_get_the_scenario_with_the_duration_of_its_setpoint(
+    name: str, tmp_path: Path,
+) -> None:
+    scenario = load_scenario(name)
+    path = tmp_path / 'parameters.yaml'
+    assert _write_parameters(scenario, path) == ['--ros-args', '--params-file', str(path)]
+    written = {key.removeprefix('/**/'): section['ros__parameters']
+               for key, section in yaml.safe_load(path.read_text()).items()}
+    wanted = scenario.parameters()
+    wanted['controller']['setpoint_duration'] = 10.0
+    # A busy machine is no broken wheel.
+    assert written['plant'].pop('command_timeout') >= wanted['plant'].pop('command_timeout')
+    assert written == wanted
+
+
+@pytest.mark.parametrize(('preset', 'told'), [
+    ('papre', 'available are paper, prototype'), ('./none.yaml', 'no such file'),
+    ('./twice.yaml', 'this scenario has 2 setpoints'),
+    ('./still.yaml', 'this scenario has 0 setpoints'),
+    ('./wrong.yaml', 'seed must be a whole number')])
+def test_scenario_that_is_no_demo_is_refused_in_one_line(
+    preset: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    content = yaml.safe_load((share_directory() / 'config' / 'scenario_paper.yaml').read_text())
+    later = {'at': 1.0, 'links': {'link_a': 0.0}}
+    for name, change in (('twice', {'setpoints': [*content['setpoints'], later]}),
+                         ('still', {'setpoints': []}), ('wrong', {'seed': 'x'})):
+        Path(f'{name}.yaml').write_text(yaml.safe_dump({**content, **change}))
+    with pytest.raises(FourbarError) as caught:
+        _one_move(preset)
+    assert told in str(caught.value)
+    assert '\n' not in str(caught.value)

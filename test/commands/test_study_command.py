@@ -1,0 +1,159 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""`fourbar study` as it is typed."""
+
+from collections.abc import Callable, Iterable
+import csv
+import json
+import math
+from pathlib import Path
+import subprocess
+import sys
+from typing import Any
+
+from fourbar_ros.analysis import studies
+from fourbar_ros.analysis.checks import at_most
+from fourbar_ros.analysis.studies import Progress, Result, validation
+from fourbar_ros.commands.main import main
+import pytest
+
+Stub = Callable[[Callable[[Progress], Result]], None]
+
+
+@pytest.fixture
+def stub(monkeypatch: pytest.MonkeyPatch) -> Stub:
+    """Return a function that puts a function in the place of the study `validation`."""
+    def replace(run: Callable[[Progress], Result]) -> None:
+        module = type(sys)('stub')
+        module.run = run  # type: ignore[attr-defined]
+        monkeypatch.setattr(studies, 'import_module', lambda name: module)
+    return replace
+
+
+def result(value: float) -> Result:
+    """Make a result with one check, kept up to 1 and not beyond."""
+    return Result([at_most('sum', value, 'rad', 1.0)], {'sum_rad': value}, 'One line.',
+                  {'sum.csv': 'sum\n', 'sum.png': b'\x89PNG'}, ['no second line: no ink'])
+
+
+def test_validation_keeps_its_checks_and_writes_what_it_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Once from end to end; one reference motion is enough for that."""
+    for library in ('sympy', 'mujoco', 'matplotlib'):
+        pytest.importorskip(library)
+    monkeypatch.setattr(validation, 'REFERENCES', ('asymmetric',))
+    monkeypatch.chdir(tmp_path)
+    assert main(['study', 'validation', '--json', 'here.json']) == 0
+    out, err = capsys.readouterr()
+    folder = tmp_path / 'study_validation'
+    assert sorted(path.name for path in folder.iterdir()) == [
+        'validation.csv', 'validation.json', 'validation.png']
+    assert err == ''
+    assert 'MISSED' not in out
+
+    document = json.loads((tmp_path / 'here.json').read_text())
+    assert document == json.loads((folder / 'validation.json').read_text())
+    assert [check['name'] for check in document['checks'] if not check['passed']] == []
+    assert document['skipped'] == []
+    png = (folder / 'validation.png').read_bytes()
+    assert png.startswith(b'\x89PNG')
+    assert len(png) < 200_000
+
+    with (folder / 'validation.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    assert {'kane', 'mujoco_1ms', 'mujoco_extrapolated', 'reference'} <= {
+        row['engine'] for row in rows}
+    for row in rows:
+        numbers = document['differences'][row['motion']][row['engine']]
+        assert float(row['max_rad']) == pytest.approx(numbers['max_rad'], rel=1e-3)
+        assert 0.0 <= float(row['rms_rad']) <= float(row['max_rad'])
+        assert row['torque'] == document['torque_sampling'][row['engine']]
+        assert row['motion'] in out
+
+
+@pytest.mark.parametrize(('value', 'code', 'word'), [
+    (1.0, 0, 'ok'), (2.0, 1, 'MISSED'), (math.nan, 1, 'MISSED')])
+def test_a_missed_check_is_exit_code_1(
+    value: float, code: int, word: str, stub: Stub, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    stub(lambda progress: Result(result(value).checks, {}, 'One line.'))
+    assert main(['study', 'validation', '-o', str(tmp_path)]) == code
+    assert word in capsys.readouterr().out
+    document = json.loads((tmp_path / 'validation.json').read_text())
+    assert [check['passed'] for check in document['checks']] == [code == 0]
+
+
+def test_files_go_where_they_are_asked_to(
+    stub: Stub, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    stub(lambda progress: result(0.5))
+    folder, document = tmp_path / 'new' / 'folder', tmp_path / 'sum.json'
+    assert main(['study', 'validation', '-o', str(folder), '--json', str(document)]) == 0
+    assert (folder / 'sum.csv').read_text() == 'sum\n'
+    assert (folder / 'sum.png').read_bytes() == b'\x89PNG'
+    assert json.loads(document.read_text()) == {
+        'study': 'validation', 'sum_rad': 0.5, 'skipped': ['no second line: no ink'],
+        'checks': [{'name': 'sum', 'value': 0.5, 'unit': 'rad', 'limit': 1.0, 'passed': True}]}
+    out, err = capsys.readouterr()
+    assert out.startswith('One line.\n')
+    assert err == 'fourbar study: no second line: no ink\n'
+
+
+def test_progress_does_not_change_what_it_shows(stub: Stub, tmp_path: Path) -> None:
+    seen: list[Any] = []
+
+    def run(progress: Progress) -> Result:
+        items: Iterable[Any] = ['a', 'b']
+        seen.extend(progress(items, 2))
+        return result(0.5)
+
+    stub(run)
+    main(['study', 'validation', '-o', str(tmp_path)])
+    assert seen == ['a', 'b']
+
+
+@pytest.mark.parametrize(('arguments', 'complaint'), [
+    (['atlantis'], "no study 'atlantis' (known are validation)"),
+    (['validation', '-o', 'file/folder'], 'cannot make file/folder'),
+    (['validation', '--json', 'nowhere/v.json'], 'cannot write nowhere/v.json'),
+])
+def test_bad_input_is_one_line_and_exit_code_2(
+    arguments: list[str], complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str], stub: Stub,
+) -> None:
+    """And it is found before the work, not after it."""
+    def fail(progress: Progress) -> Result:
+        raise AssertionError('it began to work')
+
+    stub(fail)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'file').write_text('')
+    assert main(['study', *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ''
+    assert err.startswith(f'fourbar study: {complaint}')
+    assert len(err.splitlines()) == 1
+
+
+def test_help_lists_the_studies_and_needs_no_heavy_library() -> None:
+    code = ('import sys; from fourbar_ros.commands.main import main\n'
+            'try: main(["study", "--help"])\n'
+            'finally: sys.stderr.write(str(sorted('
+            '{"numpy", "numba", "sympy", "mujoco", "matplotlib"} & set(sys.modules))))')
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert done.stderr == '[]'
+    assert all(name in done.stdout for name in studies.STUDIES)

@@ -1,0 +1,207 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A scenario runs as it is written, and its recording holds what the nodes would publish."""
+
+from dataclasses import replace
+from math import pi
+
+from fourbar_ros.loop import (
+    ClosedLoop,
+    load_scenario,
+    record_run,
+    Recording,
+    run_scenario,
+    RunError,
+    ScriptedSetpoint,
+    Step,
+)
+from fourbar_ros.plant import SensorReading
+import numpy as np
+import pytest
+
+HALF_A_DEGREE = pi / 360.0
+PERIOD_NS = 4_000_000
+
+
+@pytest.mark.parametrize('name', ['paper', 'prototype'])
+def test_preset_makes_its_quarter_turn(name: str) -> None:
+    scenario = load_scenario(name)
+    found = record_run(scenario).arrays()
+    stamps = found['sim/link_states.stamp_ns']
+    assert stamps[-1] - stamps[0] == scenario.duration * 1e9
+    true, wanted = found['sim/link_states.position'], found['reference.position']
+    assert np.abs(true[-1] - true[0] - pi / 2).max() < HALF_A_DEGREE
+    # From the first command on: before, the reference is the estimate.
+    # Ticks before the first sample arrived have none.
+    assert np.abs((wanted - true[-len(wanted):])[100:]).max() < HALF_A_DEGREE
+    # Peak of the soft step's rate times inertia of a pair, by two wheels; the prototype's number
+    # is that of its file.
+    peak = np.abs(found['sim/flywheel_states.velocity']).max()
+    assert peak == pytest.approx({'paper': 62.37, 'prototype': 48.0}[name], rel=0.1)
+
+
+@pytest.mark.parametrize('heading', ['link_a', 'link_d'])
+def test_joint_encoders_and_one_heading_serve_as_well(heading: str) -> None:
+    """The prototype makes its turn with sensors of the other kind."""
+    scenario = load_scenario('prototype')
+    sensors = replace(scenario.table.link_sensors, kind='joint', heading=heading)
+    scenario = replace(scenario, table=replace(scenario.table, link_sensors=sensors))
+    recording = record_run(scenario)
+    found = recording.arrays()
+    true, estimate = found['sim/link_states.position'], found['estimate/link_states.position']
+    assert np.abs(true[-1] - true[0] - pi / 2).max() < HALF_A_DEGREE
+    # The noise of one sample.
+    assert np.abs((estimate - true[-len(estimate):])[100:]).max() < sensors.noise_rms
+    names, table = recording.table()
+    innovations = table[:, [names.index(f'innovation_{name}') for name in (
+        f'{heading[-1]}', 'joint_1', 'joint_2', 'joint_3', 'joint_4')]]
+    assert (~np.isnan(innovations)).mean() > 0.95
+
+
+def test_script_acts_from_the_next_tick_on() -> None:
+    scenario = replace(
+        load_scenario('paper'), arm_at=0.1, duration=0.5,
+        setpoints=(ScriptedSetpoint(0.199, ('link_a',), (0.1,), 0.2),))
+    found = record_run(scenario).arrays()
+    commanded = np.flatnonzero(found['flywheel_command.effort'].any(axis=1))
+    # Tick 25 is at 0.1 s; the device is armed after it, and torque is asked for at the next one.
+    assert commanded[0] == 26
+    moving = np.flatnonzero(found['reference.velocity'].any(axis=1))
+    # Tick 50 is the first after 0.199 s, and the move is over after 50 more.
+    assert moving[0] == 51
+    assert moving[-1] == 99
+    assert found['reference.position'][-1, 0] == 0.1
+
+
+def test_duration_of_a_setpoint_holds_for_it_alone() -> None:
+    base = load_scenario('paper')
+    scenario = replace(
+        base, arm_at=0.1, duration=1.0,
+        controller=replace(base.controller, setpoint_duration=0.4),
+        setpoints=(ScriptedSetpoint(0.2, ('link_a',), (0.05,), 0.1),
+                   ScriptedSetpoint(0.4, ('link_a',), (0.1,))))
+    moving = record_run(scenario).arrays()['reference.velocity'].any(axis=1)
+    assert np.flatnonzero(moving).tolist() == [*range(51, 75), *range(101, 200)]
+
+
+def test_what_lies_behind_the_end_does_not_happen() -> None:
+    scenario = replace(load_scenario('paper'), duration=0.2)
+    steps = list(run_scenario(scenario))
+    assert len(steps) == 51
+    assert not any(step.control.torques.any() for step in steps if step.control)
+
+
+def test_refused_setpoint_ends_the_run_and_names_the_entry() -> None:
+    scenario = replace(load_scenario('paper'), arm_at=0.1, setpoints=(
+        ScriptedSetpoint(0.2, ('link_a',), (0.1,)),
+        ScriptedSetpoint(0.3, ('link_a', 'link_c'), (0.1, 0.2))))
+    with pytest.raises(RunError, match='setpoints, entry 2 at 0.3 s, refused: '):
+        list(run_scenario(scenario))
+
+
+def test_device_that_refuses_to_be_armed_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ClosedLoop, 'arm', lambda _: (False, 'refused: no sample from link_b'))
+    with pytest.raises(RunError, match='arm_at 0.3 s: refused: no sample from link_b'):
+        list(run_scenario(load_scenario('paper')))
+
+
+@pytest.mark.parametrize('name', ['paper', 'prototype'])
+def test_same_seed_same_bytes(name: str) -> None:
+    scenario = replace(load_scenario(name), duration=0.6)
+    first, again, other = (
+        ''.join(record_run(replace(scenario, seed=seed)).lines()) for seed in (7, 7, 8))
+    assert first == again
+    assert first != other
+
+
+# The recording
+
+def test_recording_is_what_the_steps_hold() -> None:
+    scenario = replace(load_scenario('paper'), duration=0.1)
+    steps = list(run_scenario(scenario))
+    found = record_run(scenario).arrays()
+    wanted: dict[str, list[np.ndarray]] = {  # type: ignore[type-arg]
+        'flywheel_states.velocity': [step.samples.wheels.speeds for step in steps],
+        'link_angles.position': [step.samples.links[0].angles for step in steps],
+        'sim/flywheel_states.position': [
+            step.samples.truth.wheel_angles for step in steps if step.samples.truth],
+        'estimate/sigma.velocity': [
+            step.estimate.rate_sigmas for step in steps if step.estimate],
+        'tracking_error.position': [step.control.angle_errors for step in steps if step.control],
+        'flywheel_command.effort': [step.control.torques for step in steps if step.control]}
+    for name, rows in wanted.items():
+        np.testing.assert_array_equal(found[name], rows, err_msg=name)
+    # No innovation at the tick that starts the filter.
+    assert len(found['estimate/innovation.position']) == len(steps) - 1
+    np.testing.assert_array_equal(
+        found['estimate/innovation.tick_ns'], found['flywheel_states.stamp_ns'][1:])
+
+
+def thinned(step: Step, samples: tuple[SensorReading, ...]) -> Step:
+    """Give a step other samples of the links."""
+    return replace(step, samples=replace(step.samples, links=samples))
+
+
+def test_what_was_not_there_stays_empty() -> None:
+    """Ticks without samples, with one of two links, and with two of different stamps."""
+    scenario = replace(load_scenario('paper'), duration=0.012)
+    steps = list(run_scenario(scenario))
+    first_ns = steps[0].samples.stamp_ns
+    partial = SensorReading(
+        first_ns + 3_000_000, ('link_b', 'link_d'), np.array([1.0, 3.0]), np.empty(0))
+    newer = SensorReading(first_ns + 5_000_000, ('link_b',), np.array([1.5]), np.empty(0))
+    recording = Recording()
+    recording.add(replace(thinned(steps[0], ()), estimate=None, control=None))
+    recording.add(thinned(steps[1], (partial,)))
+    recording.add(thinned(steps[2], (partial, newer)))
+    names, *lines = (line.rstrip('\n').split(',') for line in recording.lines())
+    rows = [dict(zip(names, line)) for line in lines]
+    assert [row['t'] for row in rows] == ['0', '0.0040000000000000001', '0.0080000000000000002']
+    assert {name for name, text in rows[0].items() if text} == {
+        name for name in names if name.startswith(('t', 'flywheel_angle', 'flywheel_speed',
+                                                   'flywheel_effort'))}
+    measured = [[row[f'measured_link_{link}'] for link in 'abcd'] for row in rows]
+    assert measured == [['', '', '', ''], ['', '1', '', '3'], ['', '1.5', '', '3']]
+    assert [float(row['measured_at_link_b'] or 'nan') for row in rows[1:]] == [0.003, 0.005]
+    assert rows[2]['measured_at_link_a'] == ''
+    np.testing.assert_array_equal(
+        recording.arrays()['link_angles.tick_ns'] - first_ns,
+        [PERIOD_NS, 2 * PERIOD_NS, 2 * PERIOD_NS])
+
+
+def test_table_reads_back_bit_for_bit() -> None:
+    scenario = replace(load_scenario('paper'), duration=0.5)
+    recording = record_run(scenario)
+    names, table = recording.table()
+    header, *lines = recording.lines()
+    assert header == ','.join(names) + '\n'
+    read = np.array([[float(cell) if cell else np.nan for cell in line.rstrip('\n').split(',')]
+                     for line in lines])
+    assert read.tobytes() == table.tobytes() or np.array_equal(read, table, equal_nan=True)
+    column = names.index('command_c')
+    np.testing.assert_array_equal(
+        table[:, column], recording.arrays()['flywheel_command.effort'][:, 2])
+
+
+def test_steps_pass_through_whoever_watches() -> None:
+    seen: list[int] = []
+
+    def watch(steps, total):  # type: ignore[no-untyped-def]
+        seen.append(total)
+        for step in steps:
+            seen.append(step.samples.stamp_ns)
+            yield step
+    recording = record_run(replace(load_scenario('paper'), duration=0.02), watch)
+    assert seen == [6, *recording.tick_stamps_ns]

@@ -1,0 +1,168 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Many motions at once: the same bytes as one by one."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from threading import Thread
+
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.forces import NOTHING, surroundings
+from fourbar_ros.mechanism.layout import STATE_SIZE
+from fourbar_ros.mechanism.motion import move_batch, move_held
+import numba
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+Draw = Callable[[np.random.Generator], Mechanism]
+
+
+@pytest.fixture
+def campaign(random_linkage: Draw, random_state: Callable[..., Array]
+             ) -> tuple[list[Mechanism], Array, Array]:
+    """Draw nine linkages, their states and torques, seed 5."""
+    rng = np.random.default_rng(5)
+    linkages = [random_linkage(rng) for _ in range(9)]
+    states = np.array([random_state(rng, linkage) for linkage in linkages])
+    return linkages, states, rng.uniform(-0.1, 0.1, (9, 4))
+
+
+@pytest.mark.parametrize('threads', [1, 2])
+def test_batch_gives_the_bytes_of_single_motions(
+    threads: int, campaign: tuple[list[Mechanism], Array, Array],
+) -> None:
+    """Each with constants and surroundings of its own."""
+    linkages, states, torques = campaign
+    constants = np.array([linkage.constants for linkage in linkages])
+    around = np.array([surroundings(joint_viscous=0.01 * n) for n in range(9)])
+    alone = states.copy()
+    for n in range(9):
+        move_held(alone[n], torques[n], 1e-3, 200, linkages[n].constants, around[n])
+    before = numba.get_num_threads()
+    numba.set_num_threads(min(threads, before))
+    try:
+        move_batch(states, torques, 1e-3, 200, constants, around)
+    finally:
+        numba.set_num_threads(before)
+    assert states.tobytes() == alone.tobytes()
+
+
+def test_one_linkage_serves_all(campaign: tuple[list[Mechanism], Array, Array]) -> None:
+    linkages, states, torques = campaign
+    states[:] = states[0]
+    alone = states[4].copy()
+    move_held(alone, torques[4], 1e-3, 50, linkages[0].constants, NOTHING)
+    move_batch(states, torques, 1e-3, 50, linkages[0].constants, NOTHING)
+    assert states[4].tobytes() == alone.tobytes()
+
+
+def test_rigid_and_soft_linkages_and_prescribed_wheels_go_together(
+    campaign: tuple[list[Mechanism], Array, Array],
+) -> None:
+    """What a row needs is in its constants."""
+    linkages, states, torques = campaign
+    constants = np.array([
+        replace(linkage, joint_stiffness=[1e3 * (n + 1)] * 4).constants if n % 3 == 0
+        else linkage.constants_with(np.arange(4) < n % 3) for n, linkage in enumerate(linkages)])
+    alone = states.copy()
+    for n in range(9):
+        move_held(alone[n], torques[n], 1e-3, 50, constants[n], NOTHING)
+    move_batch(states, torques, 1e-3, 50, constants, NOTHING)
+    assert states.tobytes() == alone.tobytes()
+
+
+def test_batch_may_hold_one_state(campaign: tuple[list[Mechanism], Array, Array]) -> None:
+    linkages, states, torques = campaign
+    alone, one = states[0].copy(), states[:1].copy()
+    move_held(alone, torques[0], 1e-3, 50, linkages[0].constants, NOTHING)
+    move_batch(one, torques[:1], 1e-3, 50, linkages[0].constants, NOTHING)
+    assert one.tobytes() == alone.tobytes()
+
+
+def test_batches_of_two_threads_wait_for_each_other(
+    campaign: tuple[list[Mechanism], Array, Array],
+) -> None:
+    """And each does what is asked of it."""
+    linkages, states, torques = campaign
+    constants = linkages[0].constants
+    states[:] = states[0]
+    alone = states.copy()
+    for n in range(9):
+        move_held(alone[n], torques[n], 1e-3, 100, constants, NOTHING)
+    # Times seven, so that they are busy for as long as it takes to start the others.
+    parts = [np.repeat(states[[n]], 63, axis=0) for n in range(4)]
+    loads = [np.tile(np.roll(torques, n, axis=0), (7, 1)) for n in range(4)]
+    threads = [Thread(target=move_batch, args=(part, load, 1e-3, 100, constants, NOTHING))
+               for part, load in zip(parts, loads)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for n, part in enumerate(parts):
+        assert part.tobytes() == np.tile(np.roll(alone, n, axis=0), (7, 1)).tobytes()
+
+
+@pytest.mark.parametrize(('made', 'word'), [
+    (lambda states: np.repeat(states, 2, axis=0)[::2], 'contiguous: False'),
+    (np.asfortranarray, 'contiguous: False'), (lambda states: states.astype(int), 'int64'),
+    (lambda states: states.astype(np.float32), 'float32'),
+    (lambda states: np.broadcast_to(states, states.shape), 'writeable: False')],
+    ids=['rows', 'columns', 'integers', 'single', 'read-only'])
+def test_states_that_lie_in_another_way_are_refused(
+    made: Callable[[Array], Array], word: str, campaign: tuple[list[Mechanism], Array, Array],
+) -> None:
+    """Not done by halves, and nothing is compiled for them."""
+    linkages, states, torques = campaign
+    given = made(states)
+    before = given.copy()
+    with pytest.raises(ValueError, match=word):
+        move_batch(given, torques, 1e-3, 10, linkages[0].constants, NOTHING)
+    np.testing.assert_array_equal(given, before)
+
+
+def test_torques_may_lie_in_any_way(campaign: tuple[list[Mechanism], Array, Array]) -> None:
+    linkages, states, torques = campaign
+    others = states.copy()
+    move_batch(states, torques, 1e-3, 10, linkages[0].constants, NOTHING)
+    move_batch(others, np.asfortranarray(torques), 1e-3, 10, linkages[0].constants, NOTHING)
+    assert others.tobytes() == states.tobytes()
+
+
+def test_no_states_are_no_work(campaign: tuple[list[Mechanism], Array, Array]) -> None:
+    constants = campaign[0][0].constants
+    move_batch(np.empty((0, STATE_SIZE)), np.empty((0, 4)), 1e-3, 1, constants, NOTHING)
+
+
+@pytest.mark.parametrize(('states', 'torques', 'mechanisms', 'surrounded'), [
+    ((3, STATE_SIZE - 1), (3, 4), 1, 1), ((STATE_SIZE,), (1, 4), 1, 1),
+    ((1, 3, STATE_SIZE), (1, 4), 1, 1), ((3, STATE_SIZE), (2, 4), 1, 1),
+    ((3, STATE_SIZE), (4,), 1, 1), ((3, STATE_SIZE), (3, 3), 1, 1),
+    ((3, STATE_SIZE), (3, 4), 2, 1), ((3, STATE_SIZE), (3, 4), 4, 1),
+    ((3, STATE_SIZE), (3, 4), 0, 1), ((3, STATE_SIZE), (3, 4), 1, 2)])
+def test_what_does_not_fit_is_refused(
+    states: tuple[int, ...], torques: tuple[int, ...], mechanisms: int, surrounded: int,
+    paper: Mechanism,
+) -> None:
+    """And told with the sizes that were given."""
+    constants = np.array([paper.constants] * 4)[:mechanisms]
+    around = np.array([NOTHING] * 2)[:surrounded]
+    before = np.zeros(states)
+    with pytest.raises(ValueError, match='1 or n constants') as refusal:
+        move_batch(before, np.ones(torques), 1e-3, 1, constants, around)
+    assert str(states) in str(refusal.value)
+    assert str(torques) in str(refusal.value)
+    assert f'got {mechanisms} and {surrounded}' in str(refusal.value)
+    assert not before.any()

@@ -1,0 +1,430 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The way past change points: ideal linkages pass, all others fold, as other engines find too."""
+
+from collections.abc import Callable
+
+from fourbar_ros.mechanism import (
+    angular_momentum,
+    assemble,
+    branch_of,
+    kinetic_energy,
+    load_mechanism,
+    Mechanism,
+    reduced_form,
+)
+from fourbar_ros.mechanism.case import Case, simulate
+from fourbar_ros.mechanism.dynamics import mass_matrix
+from fourbar_ros.mechanism.forces import NOTHING
+from fourbar_ros.mechanism.layout import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
+from fourbar_ros.mechanism.motion import move_with_cosines
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+Draw = Callable[[np.random.Generator], Mechanism]
+
+SEEDS = range(20)
+NONE = np.zeros(4)
+
+
+def momentum(linkage: Mechanism, state: Array) -> float:
+    """Return the angular momentum of links and wheels."""
+    return angular_momentum(
+        linkage, state[LINK_ANGLES], state[LINK_RATES], state[WHEEL_SPEEDS])
+
+
+def momentum_scale(linkage: Mechanism, state: Array) -> float:
+    """Return the size of what adds up to the momentum, which itself may be near zero."""
+    matrix = np.abs(mass_matrix(state[LINK_ANGLES], linkage.constants))
+    return float(matrix.sum(axis=0) @ np.abs(state[LINK_RATES])
+                 + linkage.flywheel_inertias @ np.abs(state[WHEEL_SPEEDS]))
+
+
+def energy_of_links(linkage: Mechanism, state: Array) -> float:
+    """Return the links' share: the wheels' is much larger, and constant without torque."""
+    return kinetic_energy(linkage, state[LINK_ANGLES], state[LINK_RATES], NONE)
+
+
+def centripetal_bias(angles: Array, rates: Array, linkage: Mechanism) -> Array:
+    """Evaluate h (4,) [N m]: what the links' rates alone ask of each link angle."""
+    difference = angles[None, :] - angles[:, None]
+    constants = linkage.constants
+    slope = constants.sine * np.cos(difference) - constants.cosine * np.sin(difference)
+    bias: Array = slope @ rates**2
+    return bias
+
+
+def move_under_constant_torques(
+    linkage: Mechanism, start: Array, torques: Array, step: float, steps: int,
+) -> Array:
+    """Return the states (steps + 1, STATE_SIZE) after every step."""
+    return move_with_cosines(
+        start, step * np.arange(steps + 1), torques, NONE, NONE, 1.5 * step, linkage.constants,
+        NOTHING)
+
+
+CHANGE_POINTS = (0.0, np.pi)
+STEP = 5e-4
+# Within 1e-4 rad of the change point an angle's rounding of 4e-16 rad shows as 4e-12 of the
+# rates, once per step that ends there: at 0.01 rad/s some forty of them.
+ROUNDING = 1e-9
+
+
+def parallel_state(rng: np.random.Generator, theta: float, rates: Array) -> Array:
+    """Make a state of a parallelogram, wheels turning."""
+    phi_a = rng.uniform(-3.0, 3.0)
+    return make_state(
+        np.tile([phi_a, phi_a + theta], 2), np.tile(rates, 2), rng.uniform(-9.0, 9.0, 4))
+
+
+def passage(
+    seed: int, change_point: float, random_parallelogram: Draw,
+    torques: Array = NONE, before: float = 1.0,
+) -> tuple[Mechanism, Array]:
+    """
+    Move an ideal parallelogram of four different bodies past a change point.
+
+    From theta 0.03 rad before it (times `before`: 0 starts on it), for about 0.06 rad, with theta
+    changing at 0.01 to 1 rad/s in either direction and the whole turning about as fast.
+    """
+    rng = np.random.default_rng(seed)
+    linkage = random_parallelogram(rng)
+    speed = 10.0**rng.uniform(-2.0, 0.0) * rng.choice([-1.0, 1.0])
+    rate_a = rng.uniform(-1.0, 1.0) * speed
+    start = parallel_state(
+        rng, change_point - 0.03 * before * np.sign(speed), np.array([rate_a, rate_a + speed]))
+    return linkage, move_under_constant_torques(
+        linkage, start, torques * speed**2, STEP, round(0.06 / abs(speed) / STEP))
+
+
+def motion_of_two_angles(linkage: Mechanism, start: Array, torques: Array, time: float) -> Array:
+    """
+    Return (phi_a, phi_b, omega_a, omega_b) of a parallelogram that cannot be anything else.
+
+    Its A and b, from c = a and d = b throughout, are regular at the change points.
+    """
+    def slope(y: Array) -> Array:
+        angles, rates = np.tile(y[:2], 2), np.tile(y[2:], 2)
+        matrix = mass_matrix(angles, linkage.constants)
+        force = -torques - centripetal_bias(angles, rates, linkage)
+        pairs = matrix.reshape(2, 2, 2, 2).sum(axis=(0, 2))
+        return np.concatenate([y[2:], np.linalg.solve(pairs, force.reshape(2, 2).sum(axis=0))])
+
+    # Steps of 3e-4 rad: an error of order four is below rounding.
+    y, steps = start[[0, 1, 4, 5]], 200
+    step = time / steps
+    for _ in range(steps):
+        k1 = slope(y)
+        k2 = slope(y + 0.5 * step * k1)
+        k3 = slope(y + 0.5 * step * k2)
+        k4 = slope(y + step * k3)
+        y = y + step / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
+    return y
+
+
+def assert_moves_like_two_angles(linkage: Mechanism, states: Array, torques: Array) -> None:
+    """Compare the end of a motion with that of the parallelogram that has no change points."""
+    expected = motion_of_two_angles(linkage, states[0], torques, STEP * (len(states) - 1))
+    rate = np.abs(states[0, LINK_RATES]).max()
+    end = states[-1]
+    np.testing.assert_allclose(
+        end[LINK_ANGLES], np.tile(expected[:2], 2), rtol=0.0, atol=ROUNDING)
+    np.testing.assert_allclose(
+        end[LINK_RATES], np.tile(expected[2:], 2), rtol=0.0, atol=ROUNDING * rate)
+
+
+@pytest.mark.parametrize('change_point', CHANGE_POINTS)
+@pytest.mark.parametrize('seed', SEEDS)
+def test_passage_crosses_the_change_point(
+    seed: int, change_point: float, random_parallelogram: Draw,
+) -> None:
+    _, states = passage(seed, change_point, random_parallelogram)
+    side = states[[0, -1], 1] - states[[0, -1], 0] - change_point
+    assert side[0] * side[1] < 0.0
+
+
+@pytest.mark.parametrize('change_point', CHANGE_POINTS)
+@pytest.mark.parametrize('seed', SEEDS)
+def test_passage_keeps_opposite_links_parallel(
+    seed: int, change_point: float, random_parallelogram: Draw,
+) -> None:
+    _, states = passage(seed, change_point, random_parallelogram)
+    apart = np.abs(states[:, 2:4] - states[:, 0:2])
+    assert apart.max() < ROUNDING
+
+
+@pytest.mark.parametrize('change_point', CHANGE_POINTS)
+@pytest.mark.parametrize('seed', SEEDS)
+def test_passage_keeps_momentum(
+    seed: int, change_point: float, random_parallelogram: Draw,
+) -> None:
+    linkage, states = passage(seed, change_point, random_parallelogram)
+    links_alone = states.copy()
+    links_alone[:, WHEEL_SPEEDS] = 0.0
+    drift = [abs(momentum(linkage, x) - momentum(linkage, links_alone[0])) for x in links_alone]
+    assert max(drift) < ROUNDING * momentum_scale(linkage, links_alone[0])
+
+
+@pytest.mark.parametrize('change_point', CHANGE_POINTS)
+@pytest.mark.parametrize('seed', SEEDS)
+def test_passage_keeps_energy(
+    seed: int, change_point: float, random_parallelogram: Draw,
+) -> None:
+    linkage, states = passage(seed, change_point, random_parallelogram)
+    energies = [energy_of_links(linkage, x) for x in states]
+    np.testing.assert_allclose(energies, energies[0], rtol=ROUNDING)
+
+
+@pytest.mark.parametrize('change_point', CHANGE_POINTS)
+@pytest.mark.parametrize('seed', SEEDS)
+def test_passage_has_no_jump(seed: int, change_point: float, random_parallelogram: Draw) -> None:
+    """Within one step nothing moves faster than at the fastest end of the passage, nearly."""
+    _, states = passage(seed, change_point, random_parallelogram)
+    fastest = 1.5 * np.abs(states[[0, -1], LINK_RATES]).max()
+    assert np.abs(np.diff(states[:, LINK_ANGLES], axis=0)).max() < STEP * fastest
+
+
+@pytest.mark.parametrize('change_point', CHANGE_POINTS)
+@pytest.mark.parametrize('seed', SEEDS)
+def test_passage_is_that_of_a_linkage_without_change_points(
+    seed: int, change_point: float, random_parallelogram: Draw,
+) -> None:
+    linkage, states = passage(seed, change_point, random_parallelogram)
+    assert_moves_like_two_angles(linkage, states, NONE)
+
+
+@pytest.mark.parametrize('change_point', CHANGE_POINTS)
+@pytest.mark.parametrize('seed', SEEDS)
+def test_motion_may_start_on_a_change_point(
+    seed: int, change_point: float, random_parallelogram: Draw,
+) -> None:
+    linkage, states = passage(seed, change_point, random_parallelogram, before=0.0)
+    assert_moves_like_two_angles(linkage, states, NONE)
+
+
+@pytest.mark.parametrize('change_point', CHANGE_POINTS)
+@pytest.mark.parametrize('seed', SEEDS)
+def test_moving_linkage_passes_under_torque_too(
+    seed: int, change_point: float, random_parallelogram: Draw,
+) -> None:
+    """Ideal joints hold the branch against opposite torques while theta changes."""
+    torques = np.random.default_rng(seed + 1000).uniform(-0.1, 0.1, 4)
+    linkage, states = passage(seed, change_point, random_parallelogram, torques)
+    speed = states[0, 5] - states[0, 4]
+    assert_moves_like_two_angles(linkage, states, torques * speed**2)
+
+
+@pytest.mark.parametrize('direction', [1.0, -1.0])
+@pytest.mark.parametrize('change_point', CHANGE_POINTS)
+def test_step_that_ends_on_a_change_point_is_no_obstacle(
+    change_point: float, direction: float,
+) -> None:
+    """Uniform links turn at constant rates: binary fractions bring them onto it."""
+    step, steps, rate = 2.0**-11, 128, 0.25 * direction
+    start = make_state(np.tile([0.5, 0.5 + change_point - rate * step * steps / 2], 2),
+                       np.tile([0.0, rate], 2))
+    linkage = load_mechanism('paper')
+    states = move_under_constant_torques(linkage, start, NONE, step, steps)
+    hit = states[steps // 2]
+    assert abs(np.sin(hit[1] - hit[0])) < 1e-10
+    expected = start[LINK_ANGLES] + step * steps * start[LINK_RATES]
+    np.testing.assert_allclose(states[-1, LINK_ANGLES], expected, rtol=0.0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize('change_point', CHANGE_POINTS)
+def test_linkage_at_rest_on_a_change_point_stays(change_point: float) -> None:
+    start = make_state(np.tile([0.5, 0.5 + change_point], 2))
+    states = move_under_constant_torques(load_mechanism('paper'), start, NONE, STEP, 1000)
+    np.testing.assert_array_equal(states[-1], start)
+
+
+@pytest.mark.parametrize(('change_point', 'sign'), [(0.0, 1.0), (np.pi, -1.0)])
+def test_opposite_torques_choose_the_other_branch_from_rest(
+    change_point: float, sign: float,
+) -> None:
+    """
+    On the change point they drive `eta = omega_c - omega_a`, with `omega_d - omega_b = +-eta`.
+
+    The generalized force on eta is `((tau_a - tau_c) +- (tau_b - tau_d)) / 2`.
+    """
+    torque = 1e-5
+    start = make_state(np.tile([0.5, 0.5 + change_point], 2))
+    torques = torque * np.array([1.0, sign, -1.0, -sign])
+    states = move_under_constant_torques(load_mechanism('paper'), start, torques, STEP, 400)
+    turned = states[-1, LINK_ANGLES] - start[LINK_ANGLES]
+    assert turned[2] - turned[0] > 1e-3
+    assert turned[3] - turned[1] == pytest.approx(sign * (turned[2] - turned[0]), rel=1e-6)
+
+
+# --- A thousand passages ----------------------------------------------------------------------
+
+def thousandth_passage(seed: int) -> tuple[Mechanism, Array]:
+    """
+    Draw a linkage and its passage: any rhombus or parallelogram, any rate from 0.01 to 3 rad/s.
+
+    One of three starts on the change point, and one of three is uniform and meant to hit it.
+    """
+    rng = np.random.default_rng(seed)
+    length_a = rng.uniform(0.05, 1.5)
+    length_b = length_a if seed % 2 else rng.uniform(0.5, 2.0) * length_a
+    lengths = np.array([length_a, length_b, length_a, length_b])
+    uniform = seed % 3 == 2
+    masses = np.full(4, 0.02) if uniform else rng.uniform(0.5, 2.0, 4)
+    across = np.zeros(4) if uniform else rng.uniform(-0.3, 0.3, 4) * lengths
+    along = 0.5 * lengths if uniform else rng.uniform(0.2, 0.8, 4) * lengths
+    inertias = masses * lengths**2 / 12.0
+    linkage = Mechanism(
+        lengths, masses, inertias, np.column_stack([along, across]), 0.02 * inertias)
+    rate = 10.0**rng.uniform(-2.0, np.log10(3.0)) * rng.choice([-1.0, 1.0])
+    rate_a = rng.uniform(-1.0, 1.0) * rate
+    steps = int(rng.uniform(0.04, 0.4) / abs(rate) / STEP)
+    before = 0.0 if seed % 3 == 1 else abs(rate) * STEP * (steps // 2)
+    theta = rng.choice(CHANGE_POINTS) - before * np.sign(rate)
+    phi_a = rng.uniform(-3.0, 3.0)
+    start = make_state(np.tile([phi_a, phi_a + theta], 2), np.tile([rate_a, rate_a + rate], 2))
+    return linkage, move_under_constant_torques(linkage, start, NONE, STEP, steps)
+
+
+@pytest.mark.parametrize('hundred', range(10))
+def test_a_thousand_passages_stay_on_the_branch(hundred: int) -> None:
+    """No NaN, no jump, momentum kept to 1e-10 of its parts, opposite links parallel."""
+    for seed in range(100 * hundred, 100 * hundred + 100):
+        linkage, states = thousandth_passage(seed)
+        assert np.isfinite(states).all(), f'seed {seed}'
+        fastest = np.abs(states[:, LINK_RATES]).max()
+        jump = np.abs(np.diff(states[:, LINK_ANGLES], axis=0)).max()
+        # 1e-11: what rounding in the closure leaves within 1e-4 rad of the change point.
+        assert jump <= STEP * fastest + 1e-11, f'seed {seed}'
+        few = states[::max(1, len(states) // 20)]
+        drift = max(abs(momentum(linkage, x) - momentum(linkage, states[0])) for x in few)
+        assert drift <= 1e-10 * momentum_scale(linkage, states[0]), f'seed {seed}'
+        assert np.abs(states[:, 2:4] - states[:, 0:2]).max() < ROUNDING, f'seed {seed}'
+        assert {branch_of(x[LINK_ANGLES]) for x in few} == {'open'}, f'seed {seed}'
+
+
+# --- Imperfect lengths: they fold -------------------------------------------------------------
+
+def fold(mismatch: float, change_point: float, rate: float, link: int) -> Case:
+    """Send a rhombus, one link of which is longer by a share `mismatch`, to a change point."""
+    lengths = np.full(4, 0.1)
+    lengths[link] *= 1.0 + mismatch
+    linkage = Mechanism(
+        lengths, [0.02] * 4, [2.2e-5] * 4, np.column_stack([0.5 * lengths, NONE]), [3.4e-7] * 4)
+    angles = assemble(linkage, 0.3, 0.3 + change_point - 0.2 * np.sign(rate))
+    rates = np.array([0.2 * rate, 1.2 * rate])
+    dependent = reduced_form(linkage, angles, rates).gamma @ rates
+    return Case(linkage, angles, np.concatenate([rates, dependent]), NONE, NONE, NONE, NONE,
+                1e-4 * np.arange(0, round(6e3 / abs(rate)) + 1, 50))
+
+
+FOLDS = [(1e-3, 0.0, 1.0, 0), (-1e-3, np.pi, -3.0, 1), (1e-4, np.pi, 0.3, 2), (-1e-4, 0.0, 3.0, 3)]
+
+
+@pytest.mark.parametrize(('mismatch', 'change_point', 'rate', 'link'), [
+    *FOLDS, (1e-5, 0.0, 1.0, 1), (1e-6, np.pi, -1.0, 0), (1e-7, 0.0, 0.3, 2)])
+def test_mismatch_folds_as_kane_equations_do(
+    mismatch: float, change_point: float, rate: float, link: int,
+) -> None:
+    """Beside SymPy's derivation, integrated with steps that follow the fold: 1e-5 deg."""
+    pytest.importorskip('sympy')
+    from fourbar_ros.analysis.independent import kane
+    case = fold(mismatch, change_point, rate, link)
+    expected = kane.simulate(case).link_angles
+    np.testing.assert_allclose(
+        simulate(case).link_angles, expected, rtol=0.0, atol=np.deg2rad(1e-5))
+    # It did fold: one pair of links on a line has opened, not the other.
+    assert np.abs(expected[-1, 2] - expected[-1, 0]) > 0.2
+
+
+@pytest.mark.parametrize(('mismatch', 'change_point', 'rate', 'link'), FOLDS)
+def test_mismatch_folds_as_in_a_stiff_engine(
+    mismatch: float, change_point: float, rate: float, link: int,
+) -> None:
+    """Beside MuJoCo, RK4 at 0.1 ms, as stiff as it stays stable: to the same side, 0.1 deg."""
+    pytest.importorskip('mujoco')
+    from fourbar_ros.analysis.independent.mujoco_model import MujocoLinkage, State, stiff
+    case = fold(mismatch, change_point, rate, link)
+    start = State(case.link_angles, case.link_rates, NONE, case.link_rates, np.zeros(2),
+                  np.zeros(2))
+    theirs = MujocoLinkage(case.mechanism, stiff('RK4', 1e-4), [False] * 4).move(
+        start, case.times, lambda t: NONE, sampled=0.5).link_angles
+    np.testing.assert_allclose(
+        simulate(case).link_angles, theirs, rtol=0.0, atol=np.deg2rad(0.1))
+
+
+@pytest.mark.parametrize('change_point', CHANGE_POINTS)
+@pytest.mark.parametrize('mismatch', [1e-15, 1e-12, 1e-10, 1e-9, -3e-9, 5e-9, -8e-9, 9.9e-9])
+def test_mismatch_below_resolution_passes_and_loses_nothing(
+    mismatch: float, change_point: float,
+) -> None:
+    """Lengths within 1e-8 count as equal."""
+    for rate in (1.0, -0.1):
+        case = fold(mismatch, change_point, rate, 1)
+        motion = simulate(case)
+        energy = [kinetic_energy(case.mechanism, *now, NONE)
+                  for now in zip(motion.link_angles, motion.link_rates)]
+        np.testing.assert_allclose(energy, energy[0], rtol=1e-10)
+        assert np.abs(motion.link_angles[-1, 2] - motion.link_angles[-1, 0]) < 1e-7
+
+
+@pytest.mark.parametrize('change_point', CHANGE_POINTS)
+@pytest.mark.parametrize('mismatch', [1.1e-8, -2e-8, 1e-7])
+def test_least_mismatch_that_counts_folds_and_loses_little(
+    mismatch: float, change_point: float,
+) -> None:
+    """The step divided most often is the limit: 1e-6 of the energy."""
+    for rate in (1.0, -0.1):
+        case = fold(mismatch, change_point, rate, 1)
+        motion = simulate(case)
+        energy = [kinetic_energy(case.mechanism, *now, NONE)
+                  for now in zip(motion.link_angles, motion.link_rates)]
+        np.testing.assert_allclose(energy, energy[0], rtol=1e-6)
+        assert np.abs(motion.link_angles[-1, 2] - motion.link_angles[-1, 0]) > 0.2
+
+
+def test_sign_of_the_mismatch_decides_the_side() -> None:
+    """The links turn over about joint 3 or about joint 1, by which link is too long."""
+    ends = [simulate(fold(mismatch, 0.0, 1.0, 0)).link_angles[-1] for mismatch in (1e-3, -1e-3)]
+    turned = [end[2] - end[0] for end in ends]
+    assert turned[0] < -0.5
+    assert turned[1] > 0.5
+
+
+def test_eta_at_rest_leads_to_the_folded_branch() -> None:
+    """Where only a with b, and c with d, turn, joint 4 stays on joint 2."""
+    start = make_state(np.zeros(4), [1.0, 1.0, -1.0, -1.0])
+    states = move_under_constant_torques(load_mechanism('paper'), start, NONE, STEP, 1000)
+    assert branch_of(states[-1, LINK_ANGLES]) == 'folded'
+    np.testing.assert_allclose(states[-1, 1] - states[-1, 0], 0.0, atol=ROUNDING)
+
+
+# --- From one form to the other ---------------------------------------------------------------
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_switching_between_the_forms_leaves_no_step(
+    seed: int, random_parallelogram: Draw,
+) -> None:
+    """Acceleration, from differences of the rates, changes no more across it than elsewhere."""
+    rng = np.random.default_rng(seed)
+    linkage = random_parallelogram(rng)
+    start = parallel_state(rng, 0.33, np.array([0.2, -0.6]))
+    states = move_under_constant_torques(linkage, start, NONE, STEP, 200)
+    folds = np.abs(np.sin(states[:, 3] - states[:, 2]))
+    assert folds[0] > 0.3 > folds[-1]
+    jerk = np.abs(np.diff(states[:, LINK_RATES], n=2, axis=0)).max(axis=1)
+    across = int(np.argmax(folds < 0.3))
+    smooth = np.delete(jerk, range(across - 4, across + 3)).max()
+    assert jerk.max() <= smooth + 1e-13

@@ -1,0 +1,495 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Joints that give: an independent derivation, conservation, the rigid limit, change points."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import ceil
+from typing import Any
+
+from fourbar_ros.mechanism import assemble, branch_of, Mechanism, reduced_form
+from fourbar_ros.mechanism.compliant import RESOLUTION
+from fourbar_ros.mechanism.forces import NOTHING
+from fourbar_ros.mechanism.layout import (
+    CENTRE_POSITION,
+    CENTRE_REST,
+    CENTRE_VELOCITY,
+    JOINT_GAP_RATES,
+    JOINT_GAPS,
+    LINK_ANGLES,
+    LINK_RATES,
+    make_state,
+    WHEEL_ANGLES,
+    WHEEL_SPEEDS,
+)
+from fourbar_ros.mechanism.motion import move_held, move_with_cosines
+from fourbar_ros.mechanism.totals import (
+    body_motion,
+    joint_gaps,
+    linear_momentum,
+    mechanical_energy,
+    total_angular_momentum,
+)
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+Draw = Callable[[np.random.Generator], Mechanism]
+
+SEEDS = range(10)
+NONE = np.zeros(4)
+FREE = np.zeros(4, dtype=bool)
+
+
+def soften(linkage: Mechanism, stiffness: float, ratio: float = 0.0) -> Mechanism:
+    """
+    Give all joints one stiffness [N/m] and damping.
+
+    :param ratio: of the damping to that of 1 kg on one joint which would just not swing.
+    """
+    return replace(linkage, joint_stiffness=[stiffness] * 4,
+                   joint_damping=[2.0 * ratio * np.sqrt(stiffness)] * 4)
+
+
+def with_uneven_joints(rng: np.random.Generator, linkage: Mechanism) -> Mechanism:
+    """Give every joint a stiffness and a damping of its own."""
+    return replace(linkage, joint_stiffness=10.0**rng.uniform(2.0, 3.0, 4),
+                   joint_damping=rng.uniform(0.0, 2.0, 4))
+
+
+def opened(rng: np.random.Generator, state: Array) -> Array:
+    """Open the joints of a state by about a centimetre, and let the whole travel."""
+    state = state.copy()
+    for part, size in ((CENTRE_POSITION, 1.0), (CENTRE_VELOCITY, 1.0), (JOINT_GAPS, 0.01),
+                       (JOINT_GAP_RATES, 0.1)):
+        state[part] = rng.uniform(-size, size, state[part].size)
+    return state
+
+
+def held(linkage: Mechanism, start: Array, step: float, steps: int, torques: Array = NONE
+         ) -> Array:
+    """Return the states (steps + 1, STATE_SIZE) under torques that are held."""
+    return move_with_cosines(
+        start, step * np.arange(steps + 1), torques, NONE, NONE, 1.5 * step, linkage.constants,
+        NOTHING)
+
+
+# --- An independent derivation ----------------------------------------------------------------
+
+@pytest.fixture(scope='module')
+def lagrange() -> Callable[..., Array]:
+    """
+    Derive the motion of the four bodies once more, from their potential energy.
+
+    Lagrange's equations with the springs' potential and the dampers' dissipation function, which
+    SymPy differentiates; SciPy integrates. Nothing is shared but the conventions.
+    """
+    sympy = pytest.importorskip('sympy')
+    from scipy.integrate import solve_ivp
+
+    q, v = sympy.symbols('q:12'), sympy.symbols('v:12')
+    lengths, along, across, springs, dampers = (
+        sympy.symbols(f'{name}:4') for name in ('l', 'x', 'y', 'k', 'c'))
+
+    def place(i: int, forward: Any) -> Any:
+        """Place the point of link i that is `forward` along its x axis; links one by one in q."""
+        cos, sin = sympy.cos(q[3 * i + 2]), sympy.sin(q[3 * i + 2])
+        return sympy.Matrix([q[3 * i] + cos * (forward - along[i]) + sin * across[i],
+                             q[3 * i + 1] + sin * (forward - along[i]) - cos * across[i]])
+
+    gaps = [place(0, 0) - place(1, 0), place(1, lengths[1]) - place(2, 0),
+            place(2, lengths[2]) - place(3, lengths[3]), place(3, 0) - place(0, lengths[0])]
+    # Velocity of one link relative to the other in the middle of the gap.
+    slips = [gap.jacobian(q) * sympy.Matrix(v)
+             - (v[3 * i + 2] + v[3 * k + 2]) / 2 * sympy.Matrix([-gap[1], gap[0]])
+             for gap, (i, k) in zip(gaps, ((0, 1), (1, 2), (2, 3), (3, 0)))]
+    potential = sum(k * gap.dot(gap) / 2 for k, gap in zip(springs, gaps))
+    dissipation = sum(c * slip.dot(slip) / 2 for c, slip in zip(dampers, slips))
+    forces = sympy.lambdify(
+        [q, v, lengths, along, across, springs, dampers],
+        [-potential.diff(at) - dissipation.diff(speed) for at, speed in zip(q, v)],
+        modules='math', cse=True)
+
+    def bodies(linkage: Mechanism, state: Array) -> tuple[Array, Array]:
+        """Hang b and d on a, c on b, each by its gap; then shift the mass centre in place."""
+        turn = np.exp(1j * state[LINK_ANGLES])
+        arm, rod = linkage.com_positions @ [1.0, 1j] * turn, linkage.link_lengths * turn
+        spin, share = 1j * state[LINK_RATES], linkage.link_masses / linkage.link_masses.sum()
+        open_1, open_2, open_4 = state[JOINT_GAPS].view(complex)
+        slip_1, slip_2, slip_4 = state[JOINT_GAP_RATES].view(complex)
+        at = arm + [0.0, open_1, open_1 + rod[1] + open_2, rod[0] + open_4]
+        moving = spin * arm + [
+            0.0, slip_1, slip_1 + spin[1] * rod[1] + slip_2, spin[0] * rod[0] + slip_4]
+        at += state[CENTRE_POSITION].view(complex) - share @ at
+        moving += state[CENTRE_VELOCITY].view(complex) - share @ moving
+        return (np.column_stack([at.real, at.imag, state[LINK_ANGLES]]).ravel(),
+                np.column_stack([moving.real, moving.imag, state[LINK_RATES]]).ravel())
+
+    def move(linkage: Mechanism, start: Array, time: float, amplitude: Array, frequency: Array,
+             phase: Array, prescribed: Array = FREE) -> Array:
+        """Return places and angles (12,), then speeds (12,) of the bodies after a time."""
+        parameters = [list(map(float, values)) for values in (
+            linkage.link_lengths, *linkage.com_positions.T, linkage.joint_stiffness,
+            linkage.joint_damping)]
+        wheels, omega = linkage.flywheel_inertias, 2.0 * np.pi * frequency
+        inertia = np.column_stack([
+            linkage.link_masses, linkage.link_masses,
+            linkage.link_inertias + np.where(prescribed, wheels, 0.0)]).ravel()
+        drive = np.where(prescribed, -wheels * omega**2, 1.0) * amplitude
+
+        def slope(t: float, state: Array) -> Array:
+            force = np.array(forces(state[:12].tolist(), state[12:].tolist(), *parameters))
+            force[2::3] -= drive * np.cos(omega * t + phase)
+            return np.concatenate([state[12:], force / inertia])
+
+        end: Array = solve_ivp(slope, (0.0, time), np.concatenate(bodies(linkage, start)),
+                               method='DOP853', rtol=1e-12, atol=1e-12).y[:, -1]
+        return end
+
+    return move
+
+
+def bodies_of(linkage: Mechanism, state: Array) -> Array:
+    """Return a state as the other derivation has it."""
+    place, speed = body_motion(linkage, state)
+    return np.concatenate([np.column_stack([place, state[LINK_ANGLES]]).ravel(),
+                           np.column_stack([speed, state[LINK_RATES]]).ravel()])
+
+
+def driven(rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Draw amplitudes (of torques in N m or wheel angles in rad), frequencies and phases."""
+    return rng.uniform(-0.3, 0.3, 4), rng.uniform(0.5, 3.0, 4), rng.uniform(-3.0, 3.0, 4)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_motion_agrees_with_an_independent_derivation(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+    lagrange: Callable[..., Array],
+) -> None:
+    """Driven and prescribed wheels in any mix, joints of unequal stiffness and damping."""
+    rng = np.random.default_rng(seed)
+    linkage = with_uneven_joints(rng, random_linkage(rng))
+    start = opened(rng, random_state(rng, linkage))
+    drive, prescribed = driven(rng), rng.random(4) < 0.5
+    constants = linkage.constants_with(prescribed)
+    time, step = 0.1, 0.02 / constants.fastest_joint_mode
+    end = move_with_cosines(start, np.array([0.0, time]), *drive, step, constants, NOTHING)[-1]
+    expected = lagrange(linkage, start, time, *drive, prescribed)
+    # A swing of frequency w is late by w T (w h)^4 / 120 rad after a time T. Joints open by 0.01 m
+    # swing links of 0.5 m and more by 0.03 rad at most, at w times that.
+    late = constants.fastest_joint_mode * time * 0.02**4 / 120.0
+    error = np.abs(bodies_of(linkage, end) - expected)
+    assert error[:12].max() < 0.03 * late + 1e-11
+    assert error[12:].max() < constants.fastest_joint_mode * (0.03 * late + 1e-11)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_integration_is_of_order_four(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+    lagrange: Callable[..., Array],
+) -> None:
+    """Halving the step divides the error by 16."""
+    rng = np.random.default_rng(seed)
+    linkage = with_uneven_joints(rng, random_linkage(rng))
+    start = opened(rng, random_state(rng, linkage))
+    drive = driven(rng)
+    longest = 0.4 * RESOLUTION / linkage.constants.fastest_joint_mode
+    time = 64 * longest
+    exact = lagrange(linkage, start, time, *drive)
+    errors = [
+        np.abs(bodies_of(linkage, move_with_cosines(
+            start, np.array([0.0, time]), *drive, longest / parts * (1.0 + 1e-9),
+            linkage.constants, NOTHING)[-1]) - exact).max() for parts in (1, 2, 4)]
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    # The next order shows as a tenth or so at these steps.
+    np.testing.assert_allclose(orders, 4.0, rtol=0.0, atol=0.3)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_held_wheels_count_as_part_of_their_links(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """Prescribed not to move, with nothing left that could drive them."""
+    rng = np.random.default_rng(seed)
+    linkage = with_uneven_joints(rng, random_linkage(rng))
+    start = opened(rng, random_state(rng, linkage))
+    fixed = rng.random(4) < 0.5
+    start[WHEEL_SPEEDS][fixed] = start[LINK_RATES][fixed]
+    heavier = replace(linkage, link_inertias=linkage.link_inertias + np.where(
+        fixed, linkage.flywheel_inertias, 0.0))
+    torques = np.where(fixed, 0.0, rng.uniform(-1.0, 1.0, 4))
+    ours, expected = start.copy(), start.copy()
+    move_held(ours, torques, 1e-3, 100, linkage.constants_with(fixed), NOTHING)
+    move_held(expected, torques, 1e-3, 100, heavier.constants, NOTHING)
+    # The very same numbers, since these steps are short enough to be taken in one part.
+    np.testing.assert_array_equal(ours[:8], expected[:8])
+    np.testing.assert_array_equal(ours[WHEEL_SPEEDS][fixed], ours[LINK_RATES][fixed])
+    np.testing.assert_array_equal(ours[WHEEL_ANGLES][fixed], start[WHEEL_ANGLES][fixed])
+
+
+# --- Conservation -----------------------------------------------------------------------------
+
+# Of the fastest swing in one step, of which the method takes (w h)^6 / 144 of its size.
+FINE = 0.05
+STEPS = 1000
+TAKEN = STEPS * FINE**6 / 144.0
+
+
+def swinging(seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+             damped: bool = False) -> tuple[Mechanism, Array, float]:
+    """Move a linkage with uneven joints freely; return it, its states and the step."""
+    rng = np.random.default_rng(seed)
+    linkage = with_uneven_joints(rng, random_linkage(rng))
+    start = opened(rng, random_state(rng, linkage))
+    if not damped:
+        linkage = replace(linkage, joint_damping=NONE)
+    step = FINE / linkage.constants.fastest_joint_mode
+    return linkage, held(linkage, start, step, STEPS), step
+
+
+def opening(linkage: Mechanism, state: Array) -> Array:
+    """Return the slip of joints 1 to 4 in the middle of their gaps, (4,) complex [m/s]."""
+    rod = linkage.link_lengths * np.exp(1j * state[LINK_ANGLES])
+    rates = state[LINK_RATES]
+    slips = []
+    for (first, second, fourth), side in (
+            (state[JOINT_GAPS].view(complex), rod),
+            (state[JOINT_GAP_RATES].view(complex), 1j * rates * rod)):
+        third = first + side[1] + second + side[2] - side[3] - fourth - side[0]
+        slips.append(np.array([first, second, third, fourth]))
+    gaps, gap_rates = slips
+    mean: Array = 0.5 * (rates[[0, 1, 3, 0]] + rates[[1, 2, 2, 3]])
+    slip: Array = gap_rates - 1j * mean * gaps
+    return slip
+
+
+@pytest.mark.parametrize('damped', [False, True])
+@pytest.mark.parametrize('seed', SEEDS)
+def test_mass_centre_moves_uniformly(
+    seed: int, damped: bool, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """Linear momentum is a sum of the speeds, which every Runge-Kutta method keeps."""
+    linkage, states, step = swinging(seed, random_linkage, random_state, damped)
+    start, end = states[0], states[-1]
+    # One rounding of some 1 kg m/s in each of a thousand steps, at worst all the same way.
+    np.testing.assert_allclose(
+        linear_momentum(linkage, end), linear_momentum(linkage, start), rtol=0.0, atol=1e-12)
+    way = STEPS * step * start[CENTRE_VELOCITY]
+    np.testing.assert_allclose(
+        end[CENTRE_POSITION], start[CENTRE_POSITION] + way, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize('damped', [False, True])
+@pytest.mark.parametrize('seed', SEEDS)
+def test_angular_momentum_is_kept(
+    seed: int, damped: bool, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    linkage, states, _ = swinging(seed, random_linkage, random_state, damped)
+    momentum = [total_angular_momentum(linkage, state) for state in states[::50]]
+    # Each of a thousand steps rounds some 5 kg m^2/s.
+    np.testing.assert_allclose(momentum, momentum[0], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_energy_is_kept_without_damping(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    linkage, states, _ = swinging(seed, random_linkage, random_state)
+    energies = [mechanical_energy(linkage, state) for state in states[::50]]
+    # What the swings hold: the springs, and 1 kg in each joint.
+    stretch, speed = joint_gaps(linkage, states[0]) @ [1.0, 1j], opening(linkage, states[0])
+    swings = 0.5 * float(linkage.joint_stiffness @ np.abs(stretch)**2 + (np.abs(speed)**2).sum())
+    np.testing.assert_allclose(energies, energies[0], rtol=0.0, atol=TAKEN * swings)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_damping_takes_energy_at_every_step(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    linkage, states, _ = swinging(seed, random_linkage, random_state, damped=True)
+    energies = [mechanical_energy(linkage, state) for state in states]
+    assert np.diff(energies).max() < 0.0
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_damping_takes_what_the_dampers_work_is(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """Their power, damping times opening speed squared, added up by Simpson's rule."""
+    linkage, states, step = swinging(seed, random_linkage, random_state, damped=True)
+    lost = mechanical_energy(linkage, states[0]) - mechanical_energy(linkage, states[-1])
+    power = np.array([linkage.joint_damping @ np.abs(opening(linkage, x))**2 for x in states])
+    work = step / 3.0 * (
+        power[0] + 4.0 * power[1::2].sum() + 2.0 * power[2:-1:2].sum() + power[-1])
+    # The rule leaves (2 w h)^4 / 180 of what swings at twice the frequency.
+    assert lost == pytest.approx(work, rel=(2.0 * FINE)**4 / 180.0)
+    assert lost > 0.01
+
+
+# --- The rigid limit --------------------------------------------------------------------------
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_stiff_joints_come_near_rigid_ones(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+    move_freely: Callable[..., Array],
+) -> None:
+    """
+    Ten times the stiffness, a tenth of the difference in angle, over two decades.
+
+    The joints are open by force over stiffness, once damping has taken the first swing.
+    """
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    start = random_state(rng, linkage, 0.7)
+    rigid = move_freely(linkage, start, 1e-3, 300)[-1]
+    apart = []
+    for stiffness in (1e4, 1e5, 1e6):
+        end = held(soften(linkage, stiffness, 1.0), start, 1e-3, 300)[-1]
+        apart.append(np.abs(end[LINK_ANGLES] - rigid[LINK_ANGLES]).max())
+    decades = np.log10(np.array(apart[:-1]) / apart[1:])
+    # At 1e4 N/m the next power of 1 / stiffness still shows as a few hundredths.
+    np.testing.assert_allclose(decades, 1.0, rtol=0.0, atol=0.1)
+
+
+@pytest.mark.parametrize('stiffness', [[1e4] * 4, [1e3, 4e3, 9e3, 2e4]])
+def test_static_load_opens_joints_by_force_over_stiffness(
+    paper: Mechanism, stiffness: list[float],
+) -> None:
+    """
+    Opposite torques on opposite links of a parallelogram only load the joints.
+
+    Each link takes its couple from two opposite forces, so all four joints carry one force P:
+    `e_a x P` times its length balances the torque on link a, `e_b x -P` that on link b.
+    """
+    linkage = replace(paper, joint_stiffness=stiffness, joint_damping=0.1 * np.sqrt(stiffness))
+    state = make_state([0.2, 1.2, 0.2, 1.2])
+    torques = np.array([1e-3, -2e-3, -1e-3, 2e-3])
+    move_held(state, torques, 1e-3, 50, linkage.constants, NOTHING)
+    a, b = 0.1 * np.exp(0.2j), 0.1 * np.exp(1.2j)
+    force = np.hypot(*np.linalg.solve([[-a.imag, a.real], [b.imag, -b.real]], torques[:2]))
+    gaps = np.hypot(*joint_gaps(linkage, state).T)
+    # Open joints turn the links by that much, relative to their length, and with them the force.
+    np.testing.assert_allclose(gaps * stiffness, force, rtol=gaps.max() / 0.1)
+
+
+def near_alignment(link: int, mismatch: float, stiffness: float) -> tuple[Mechanism, Array]:
+    """Let a rhombus of 1 m and 4 kg, but for one length, come to theta = 0 at 0.3 rad/s."""
+    lengths = np.ones(4)
+    lengths[link] += mismatch
+    linkage = Mechanism(
+        lengths, np.ones(4), np.full(4, 1 / 12), np.column_stack([lengths / 2, NONE]),
+        np.full(4, 1e-3))
+    if np.isfinite(stiffness):
+        linkage = soften(linkage, stiffness, 0.1)
+    angles, rates = assemble(linkage, 0.15, -0.15), np.array([-0.15, 0.15])
+    dependent = reduced_form(linkage, angles, rates).gamma @ rates
+    return linkage, make_state(angles, np.concatenate([rates, dependent]))
+
+
+@pytest.mark.parametrize('mismatch', [1e-3, -1e-3])
+@pytest.mark.parametrize('link', range(4))
+def test_soft_rhombus_that_does_not_quite_match_passes(link: int, mismatch: float) -> None:
+    """
+    In line, four springs take up the mismatch x: they hold stiffness x^2 / 8.
+
+    At 1e3 N/m that is a hundredth of the energy with which theta comes along, 0.015 J.
+    """
+    linkage, state = near_alignment(link, mismatch, 1e3)
+    move_held(state, NONE, 1e-3, 2000, linkage.constants, NOTHING)
+    a, b, c, d = state[LINK_ANGLES]
+    assert b - a > 0.25
+    assert abs(c - a) < 0.02
+    assert abs(d - b) < 0.02
+
+
+@pytest.mark.parametrize('stiffness', [1e7, np.inf])
+@pytest.mark.parametrize('link', range(4))
+def test_stiff_rhombus_that_does_not_quite_match_folds(link: int, stiffness: float) -> None:
+    """Two pairs of links, a with b and c with d; the sign of the mismatch decides which way."""
+    ways = []
+    for mismatch in (1e-3, -1e-3):
+        linkage, state = near_alignment(link, mismatch, stiffness)
+        move_held(state, NONE, 1e-3, 2000, linkage.constants, NOTHING)
+        a, b, c, d = state[LINK_ANGLES]
+        # Theta times the angle between the pairs is about the mismatch over the length.
+        assert abs(b - a) < 0.01
+        assert abs(d - c) < 0.01
+        ways.append(c - a)
+    assert min(np.abs(ways)) > 0.5
+    assert ways[0] * ways[1] < 0.0
+
+
+@pytest.mark.parametrize('change_point', [0.0, np.pi])
+def test_soft_rhombus_passes_change_points_as_a_parallelogram(change_point: float) -> None:
+    """Exactly equal lengths leave the springs at rest but for what the turning asks of them."""
+    linkage = soften(Mechanism(  # type: ignore[arg-type]
+        [1.0] * 4, [1.0] * 4, [1 / 12] * 4, [[0.5, 0.0]] * 4, [1e-3] * 4), 1e4, 0.1)
+    start = make_state(np.tile([0.15, change_point - 0.15], 2), np.tile([-0.15, 0.15], 2))
+    end = held(linkage, start, 1e-3, 2000)[-1]
+    # Uniform links in a parallelogram turn at constant rates.
+    np.testing.assert_allclose(
+        end[LINK_ANGLES], start[LINK_ANGLES] + 2.0 * start[LINK_RATES], rtol=0.0, atol=1e-3)
+    assert branch_of(end[LINK_ANGLES]) == 'open'
+
+
+# --- Steps ------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('stiffness', 'damping'), [(1e5, 0.0), (1e5, 50.0), (1e3, 500.0)])
+def test_long_steps_at_stiff_joints_stay_stable(stiffness: float, damping: float) -> None:
+    """Links of 0.3 m and 0.6 kg, at rest but for joints open by 1 mm, ten seconds at 5 ms."""
+    linkage = Mechanism(  # type: ignore[arg-type]
+        [0.3] * 4, [0.6] * 4, [6e-3] * 4, [[0.15, 0.0]] * 4, [1.2e-4] * 4,
+        joint_stiffness=[stiffness] * 4, joint_damping=[damping] * 4)
+    start = make_state([0.0, 1.0, 0.0, 1.0])
+    start[JOINT_GAPS] = [1e-3, 0.0, 0.0, 1e-3, -1e-3, 1e-3]
+    states = held(linkage, start, 5e-3, 2000)
+    energies = np.array([mechanical_energy(linkage, state) for state in states])
+    # Explicit methods that are stable take a little energy from every swing.
+    assert np.diff(energies).max() <= 1e-12 * energies[0]
+    assert energies[-1] < energies[0]
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_step_is_divided_as_the_joints_need(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """One long step is the same as that many short ones."""
+    rng = np.random.default_rng(seed)
+    linkage = with_uneven_joints(rng, random_linkage(rng))
+    start = opened(rng, random_state(rng, linkage))
+    torques, step = rng.uniform(-1.0, 1.0, 4), 0.05
+    parts = ceil(linkage.constants.fastest_joint_mode * step / RESOLUTION)
+    assert parts > 3
+    once, many = start.copy(), start.copy()
+    move_held(once, torques, step, 1, linkage.constants, NOTHING)
+    move_held(many, torques, step / parts, parts, linkage.constants, NOTHING)
+    # Between the short ones the state is rounded once more; speeds reach 10 rad/s or so. The
+    # last entries hold what rounding left.
+    np.testing.assert_allclose(
+        once[:CENTRE_REST.start], many[:CENTRE_REST.start], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_state_is_the_same_after_the_way_to_the_bodies_and_back(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """A step of no time, of joints that are open and a mass centre anywhere."""
+    rng = np.random.default_rng(seed)
+    linkage = with_uneven_joints(rng, random_linkage(rng))
+    start = opened(rng, random_state(rng, linkage))
+    there = start.copy()
+    move_held(there, rng.uniform(-1.0, 1.0, 4), 0.0, 1, linkage.constants, NOTHING)
+    np.testing.assert_allclose(there, start, rtol=0.0, atol=1e-14)

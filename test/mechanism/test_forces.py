@@ -1,0 +1,546 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What acts besides the motors: closed forms, balances, and an independent derivation."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.constrained import constrained_accelerations, directions
+from fourbar_ros.mechanism.forces import ForceError, grip, NOTHING, Surroundings, surroundings
+from fourbar_ros.mechanism.layout import (
+    CENTRE_POSITION,
+    CENTRE_VELOCITY,
+    LINK_ANGLES,
+    LINK_RATES,
+    make_state,
+    WHEEL_SPEEDS,
+)
+from fourbar_ros.mechanism.motion import evaluate, move_with_cosines
+from fourbar_ros.mechanism.reduced import reduced_accelerations, side_of_joint_3
+from fourbar_ros.mechanism.totals import (
+    body_motion,
+    mechanical_energy,
+    total_angular_momentum,
+)
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+Draw = Callable[[np.random.Generator], Mechanism]
+
+SEEDS = range(20)
+NONE = np.zeros(4)
+STEP = 1e-3
+
+# The two links of joints 1 to 4.
+JOINTS = [(0, 1), (1, 2), (2, 3), (3, 0)]
+
+
+def moved(linkage: Mechanism, start: Array, around: Surroundings, steps: int = 500,
+          step: float = STEP) -> Array:
+    """Return the states (steps + 1, STATE_SIZE) of a motion without motors."""
+    return move_with_cosines(
+        start, step * np.arange(steps + 1), NONE, NONE, NONE, 1.5 * step, linkage.constants,
+        around)
+
+
+def travelling(rng: np.random.Generator, state: Array) -> Array:
+    """Put the mass centre somewhere, and let it move."""
+    state = state.copy()
+    state[CENTRE_POSITION], state[CENTRE_VELOCITY] = rng.uniform(-1.0, 1.0, (2, 2))
+    return state
+
+
+def everything(rng: np.random.Generator) -> dict[str, Any]:
+    """Draw all effects at once, no two joints or links alike."""
+    return {
+        'joint_coulomb': rng.uniform(0.0, 0.1, 4), 'joint_viscous': rng.uniform(0.0, 0.1, 4),
+        'smoothing': 0.1, 'link_drag': rng.uniform(0.0, 0.5, 4),
+        'link_spin_drag': rng.uniform(0.0, 0.1, 4), 'gravity': rng.uniform(-1.0, 1.0, 2),
+        'link_torques': rng.uniform(-0.3, 0.3, 4)}
+
+
+# --- Closed forms -----------------------------------------------------------------------------
+
+# The paper's links in a parallelogram: A = 1.44e-4 kg m^2 for a and c together, and for b and d
+# together, in every configuration, and no bias. Each of the four joints is between the two pairs.
+A = 1.44e-4
+
+
+def two_pairs(rate_a: float, rate_b: float) -> Array:
+    """Place the paper's linkage far from change points."""
+    return make_state([0.3, 1.5, 0.3, 1.5], np.tile([rate_a, rate_b], 2))
+
+
+def test_viscous_joints_stop_the_configuration_exponentially(paper: Mechanism) -> None:
+    """Four joints take 4 c d(theta)/dt from one pair, and give it to the other."""
+    friction = 3e-6
+    states = moved(paper, two_pairs(0.6, -0.2), surroundings(joint_viscous=friction))
+    rate = np.exp(-8.0 * friction / A * STEP * np.arange(501))
+    # Order four: (8 c / A h)^4 / 120, with 1.7e-4 rad per step.
+    np.testing.assert_allclose(states[:, 5] - states[:, 4], -0.8 * rate, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(states[:, 5] + states[:, 4], 0.4, rtol=0.0, atol=1e-13)
+
+
+def test_coulomb_joints_stop_the_configuration_linearly(paper: Mechanism) -> None:
+    """Far above the smoothing rate the friction does not depend on the rate."""
+    friction = 2e-6
+    around = surroundings(joint_coulomb=friction, smoothing=1e-6)
+    states = moved(paper, two_pairs(0.6, -0.2), around)
+    rate = 0.8 - 8.0 * friction / A * STEP * np.arange(501)
+    # Smoothing takes (1e-6 / 0.7)^2 / 2 of it.
+    np.testing.assert_allclose(states[:, 4] - states[:, 5], rate, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_coulomb_friction_holds_to_creep(paper: Mechanism, sign: float) -> None:
+    """
+    Half of the torque that would break it loose makes it creep, at the smoothing rate / root 3.
+
+    With torques -T, T, -T, T on the links each joint carries T / 2 against its friction T.
+    """
+    torque, smoothing = 2e-4, 1e-2
+    around = surroundings(joint_coulomb=torque, smoothing=smoothing,
+                          link_torques=sign * torque * np.array([-1.0, 1.0, -1.0, 1.0]))
+    end = moved(paper, two_pairs(0.0, 0.0), around, 300)[-1]
+    # By then exp(-(3/4)^1.5 8 T / (A smoothing) t) is left: 1e-93.
+    assert end[5] - end[4] == pytest.approx(sign * smoothing / np.sqrt(3.0), rel=1e-9)
+
+
+def test_friction_leaves_a_linkage_at_rest_alone(paper: Mechanism) -> None:
+    start = two_pairs(0.0, 0.0)
+    around = surroundings(joint_coulomb=1e-3, joint_viscous=1e-3, link_drag=1.0,
+                          link_spin_drag=1e-3)
+    end = moved(paper, start, around, 10)[-1]
+    np.testing.assert_array_equal(end[LINK_RATES], NONE)
+    # Links c and d are worked out anew from a and b.
+    np.testing.assert_allclose(end, start, rtol=0.0, atol=1e-15)
+
+
+def test_spin_drag_stops_each_pair_exponentially(paper: Mechanism) -> None:
+    drag = 2e-5
+    states = moved(paper, two_pairs(0.6, -0.2), surroundings(link_spin_drag=drag))
+    rate = np.exp(-2.0 * drag / A * STEP * np.arange(501))
+    np.testing.assert_allclose(states[:, 4], 0.6 * rate, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(states[:, 5], -0.2 * rate, rtol=0.0, atol=1e-13)
+
+
+def test_drag_on_mass_centres_slows_a_turn_by_their_distance(paper: Mechanism) -> None:
+    """
+    Two links move at `rate l / 2` where the other pair turns, on either side.
+
+    The pair itself turns about its mass centres, so that its drag is 2 (l / 2)^2 k.
+    """
+    drag = 1e-2
+    states = moved(paper, two_pairs(0.6, -0.2), surroundings(link_drag=drag))
+    rate = np.exp(-2.0 * drag * 0.05**2 / A * STEP * np.arange(501))
+    np.testing.assert_allclose(states[:, 4], 0.6 * rate, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(states[:, 5], -0.2 * rate, rtol=0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_drag_in_proportion_to_mass_stops_the_mass_centre_exponentially(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    start = travelling(rng, random_state(rng, linkage, 0.7))
+    decay = 0.8
+    states = moved(linkage, start, surroundings(link_drag=decay * linkage.link_masses))
+    left = np.exp(-decay * STEP * np.arange(501))[:, np.newaxis]
+    velocity, place = start[CENTRE_VELOCITY], start[CENTRE_POSITION]
+    np.testing.assert_allclose(states[:, CENTRE_VELOCITY], velocity * left, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(
+        states[:, CENTRE_POSITION], place + velocity * (1.0 - left) / decay, rtol=0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_tilted_table_takes_the_mass_centre_to_its_terminal_speed(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """Drag of `k` per mass bears the slope `g` at the speed g / k."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    start = travelling(rng, random_state(rng, linkage, 0.7))
+    slope, decay = rng.uniform(-1.0, 1.0, 2), 20.0
+    around = surroundings(link_drag=decay * linkage.link_masses, gravity=slope)
+    end = moved(linkage, start, around, 1500)[-1]
+    # exp(-20 1.5) of about 1 m/s is left.
+    np.testing.assert_allclose(end[CENTRE_VELOCITY], slope / decay, rtol=0.0, atol=2e-13)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_mass_centre_falls_down_a_tilted_table(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """As g t^2 / 2, which is no approximation to a method of order four."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    start = travelling(rng, random_state(rng, linkage))
+    slope = rng.uniform(-1.0, 1.0, 2)
+    states = moved(linkage, start, surroundings(gravity=slope))
+    time = STEP * np.arange(501)[:, np.newaxis]
+    velocity, place = start[CENTRE_VELOCITY], start[CENTRE_POSITION]
+    # One rounding of 1 m or 1 m/s in each of 500 steps.
+    np.testing.assert_allclose(
+        states[:, CENTRE_VELOCITY], velocity + slope * time, rtol=0.0, atol=5e-14)
+    np.testing.assert_allclose(states[:, CENTRE_POSITION],
+                               place + velocity * time + slope * time**2 / 2.0, rtol=0.0,
+                               atol=5e-14)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_tilted_table_does_not_change_the_motion_about_the_mass_centre(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    start = travelling(rng, random_state(rng, linkage, 0.7))
+    tilted = moved(linkage, start, surroundings(gravity=[0.3, -0.4]))
+    level = moved(linkage, start, NOTHING)
+    # Rounding of the forces, which should add up to nothing.
+    np.testing.assert_allclose(tilted[:, :8], level[:, :8], rtol=0.0, atol=1e-13)
+
+
+# --- Balances ---------------------------------------------------------------------------------
+
+def relative_rates(states: Array) -> Array:
+    """Return how fast joints 1 to 4 turn, (n, 4) [rad/s]."""
+    return np.stack([states[:, second] - states[:, first] for first, second in JOINTS], axis=1)
+
+
+def power_of(linkage: Mechanism, states: Array, effects: dict[str, Any]) -> Array:
+    """Evaluate what the effects give, (n,) [W], each from what it is said to be."""
+    zero: Any = np.zeros(4)
+    given = {**dict.fromkeys(
+        ('joint_coulomb', 'joint_viscous', 'link_drag', 'link_spin_drag', 'link_torques'), zero),
+        'gravity': np.zeros(2), 'smoothing': 1.0, **effects}
+    rates = states[:, LINK_RATES]
+    joints = relative_rates(rates)
+    speeds = np.array([body_motion(linkage, state)[1] for state in states])
+    coulomb = joints**2 / np.sqrt(joints**2 + given['smoothing']**2)
+    power: Array = (
+        rates @ given['link_torques'] - rates**2 @ given['link_spin_drag']
+        - joints**2 @ given['joint_viscous'] - coulomb @ given['joint_coulomb']
+        - (speeds**2).sum(axis=2) @ given['link_drag']
+        + (speeds @ given['gravity']) @ linkage.link_masses)
+    return power
+
+
+@pytest.mark.parametrize('effect', ['joint_coulomb', 'joint_viscous', 'link_drag',
+                                    'link_spin_drag', 'gravity', 'link_torques', 'all'])
+@pytest.mark.parametrize('seed', SEEDS)
+def test_energy_changes_by_the_work_of_the_effects(
+    seed: int, effect: str, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """Their power, such as -c times rate squared in viscous joints, added up by Simpson's rule."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    start = travelling(rng, random_state(rng, linkage, 0.7))
+    start[WHEEL_SPEEDS] = 0.0
+    effects = everything(rng)
+    if effect != 'all':
+        effects = {effect: effects[effect], 'smoothing': 0.1}
+    states = moved(linkage, start, surroundings(**effects), 200)
+    power = power_of(linkage, states, effects)
+    work = STEP / 3.0 * (
+        power[0] + 4.0 * power[1::2].sum() + 2.0 * power[2:-1:2].sum() + power[-1])
+    gained = mechanical_energy(linkage, states[-1]) - mechanical_energy(linkage, states[0])
+    # Links turn over at 10 rad/s at most: (w h)^4 / 180 of 1 W during 0.2 s.
+    assert gained == pytest.approx(work, rel=0.0, abs=1e-11)
+    assert abs(gained) > 1e-4
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_friction_and_drag_never_give_energy(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """At no step, down to rest and through it."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    start = travelling(rng, random_state(rng, linkage, 0.7))
+    start[WHEEL_SPEEDS] = 0.0
+    effects = everything(rng)
+    del effects['gravity'], effects['link_torques']
+    states = moved(linkage, start, surroundings(**effects), 2000, 5e-3)
+    energies = [mechanical_energy(linkage, state) for state in states]
+    assert np.diff(energies).max() < 0.0
+    assert energies[-1] < 0.1 * energies[0]
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_joint_friction_keeps_momentum(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """It acts between links, and the mass centre does not feel it at all."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    start = travelling(rng, random_state(rng, linkage))
+    around = surroundings(joint_coulomb=0.1, joint_viscous=rng.uniform(0.0, 0.1, 4))
+    states = moved(linkage, start, around, 1000)
+    momentum = [total_angular_momentum(linkage, state) for state in states[::50]]
+    np.testing.assert_allclose(momentum, momentum[0], rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(
+        states[:, CENTRE_VELOCITY], np.broadcast_to(start[CENTRE_VELOCITY], (1001, 2)),
+        rtol=0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_outside_torques_give_their_impulse(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """Whatever joint friction does meanwhile."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    start = random_state(rng, linkage)
+    torques = rng.uniform(-0.3, 0.3, 4)
+    around = surroundings(link_torques=torques, joint_viscous=0.05)
+    states = moved(linkage, start, around, 1000)
+    gained = [total_angular_momentum(linkage, state)
+              - total_angular_momentum(linkage, start) for state in states[::50]]
+    np.testing.assert_allclose(
+        gained, torques.sum() * STEP * 50 * np.arange(21), rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_tilted_table_and_drag_change_momentum_about_the_origin_by_their_moment(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """Each force at its mass centre, added up over the motion by Simpson's rule."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    start = travelling(rng, random_state(rng, linkage, 0.7))
+    slope, drag = rng.uniform(-1.0, 1.0, 2), rng.uniform(0.0, 0.5, 4)
+    states = moved(linkage, start, surroundings(gravity=slope, link_drag=drag), 200)
+    moment = np.empty(201)
+    for n, state in enumerate(states):
+        place, speed = body_motion(linkage, state)
+        force = linkage.link_masses[:, np.newaxis] * slope - drag[:, np.newaxis] * speed
+        moment[n] = (place[:, 0] * force[:, 1] - place[:, 1] * force[:, 0]).sum()
+    impulse = STEP / 3.0 * (
+        moment[0] + 4.0 * moment[1::2].sum() + 2.0 * moment[2:-1:2].sum() + moment[-1])
+    gained = total_angular_momentum(linkage, states[-1]) - total_angular_momentum(linkage, start)
+    assert gained == pytest.approx(impulse, rel=0.0, abs=1e-11)
+
+
+# --- Every way to solve them ------------------------------------------------------------------
+
+@pytest.mark.parametrize('fold', [0.3, 0.05])
+@pytest.mark.parametrize('seed', SEEDS)
+def test_reduced_and_constrained_solutions_agree(
+    seed: int, fold: float, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    state = travelling(rng, random_state(rng, linkage, fold))
+    around, torques = surroundings(**everything(rng)), rng.uniform(-1.0, 1.0, 4)
+    a, b, c, d = state[LINK_ANGLES]
+    reduced = reduced_accelerations(
+        a, np.cos(b - a), np.sin(b - a), side_of_joint_3(c, d), state[4], state[5],
+        *state[CENTRE_VELOCITY], torques, linkage.constants, around)
+    links, centre, total = constrained_accelerations(
+        a, *directions((a, b, c, d)), tuple(state[LINK_RATES]), tuple(state[CENTRE_VELOCITY]),
+        torques, linkage.constants, around)
+    # A few hundred roundings, and the reduced form divides by the fold twice.
+    np.testing.assert_allclose(reduced[:7], [*links, *centre, total], rtol=0.0,
+                               atol=1e-12 / np.sin(d - c)**2 * max(1.0, np.abs(links).max()))
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_stiff_joints_come_near_rigid_ones(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+) -> None:
+    """With all effects: ten times the stiffness, a tenth of the difference in angle and place."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    start = travelling(rng, random_state(rng, linkage, 0.7))
+    around = surroundings(**everything(rng))
+    rigid = moved(linkage, start, around, 300)[-1]
+    apart = []
+    for stiffness in (1e4, 1e5, 1e6):
+        soft = replace(linkage, joint_stiffness=[stiffness] * 4,
+                       joint_damping=[2.0 * np.sqrt(stiffness)] * 4)
+        end = moved(soft, start, around, 300)[-1]
+        apart.append([np.abs(end[part] - rigid[part]).max()
+                      for part in (LINK_ANGLES, CENTRE_POSITION)])
+    decades = np.log10(np.array(apart[:-1]) / apart[1:])
+    # The next power of 1 / stiffness shows, most for the place, which differs by micrometres.
+    np.testing.assert_allclose(decades[:, 0], 1.0, rtol=0.0, atol=0.1)
+    np.testing.assert_allclose(decades[:, 1], 1.0, rtol=0.0, atol=0.3)
+
+
+# --- An independent derivation ----------------------------------------------------------------
+
+@pytest.fixture(scope='module')
+def maximal() -> Callable[..., Array]:
+    """
+    Derive the accelerations once more, in maximal coordinates, from energies alone.
+
+    Coordinates: mass centre and angle of each link. Friction and drag come from a dissipation
+    function, the slope of the table from a potential, and the eight conditions of the joints
+    bring multipliers; SymPy differentiates. Nothing is shared but the conventions.
+    """
+    sympy = pytest.importorskip('sympy')
+    q, v = sympy.symbols('q:12'), sympy.symbols('v:12')
+    lengths, masses, along, across, coulomb, viscous, drag, spin_drag = (
+        sympy.symbols(f'{name}:4') for name in ('l', 'm', 'x', 'y', 'T', 'c', 'd', 's'))
+    slope, smoothing = sympy.symbols('g:2'), sympy.symbols('smoothing')
+
+    def place(i: int, forward: Any) -> Any:
+        """Place the point of link i that is `forward` along its x axis; links one by one in q."""
+        cos, sin = sympy.cos(q[3 * i + 2]), sympy.sin(q[3 * i + 2])
+        return sympy.Matrix([q[3 * i] + cos * (forward - along[i]) + sin * across[i],
+                             q[3 * i + 1] + sin * (forward - along[i]) - cos * across[i]])
+
+    gaps = sympy.Matrix([
+        place(0, 0) - place(1, 0), place(1, lengths[1]) - place(2, 0),
+        place(2, lengths[2]) - place(3, lengths[3]), place(3, 0) - place(0, lengths[0])])
+    jacobian = gaps.jacobian(q)
+    opening = jacobian * sympy.Matrix(v)
+    potential = -sum(
+        masses[i] * (slope[0] * q[3 * i] + slope[1] * q[3 * i + 1]) for i in range(4))
+    joints = [v[3 * i + 2] - v[3 * k + 2] for i, k in JOINTS]
+    dissipation = sum(
+        coulomb[i] * sympy.sqrt(joints[i]**2 + smoothing**2) + viscous[i] * joints[i]**2 / 2
+        + drag[i] * (v[3 * i]**2 + v[3 * i + 1]**2) / 2 + spin_drag[i] * v[3 * i + 2]**2 / 2
+        for i in range(4))
+    terms = sympy.lambdify(
+        [q, v, lengths, masses, along, across, coulomb, viscous, drag, spin_drag, slope,
+         smoothing],
+        [[-potential.diff(at) - dissipation.diff(speed) for at, speed in zip(q, v)],
+         jacobian, opening.jacobian(q) * sympy.Matrix(v)], cse=True)
+
+    def solve(linkage: Mechanism, state: Array, torques: Array, effects: dict[str, Any]) -> Array:
+        """Return the accelerations of the bodies (4, 3): x, y, angle."""
+        place_of, speed = body_motion(linkage, state)
+        force, jac, centripetal = terms(
+            np.column_stack([place_of, state[LINK_ANGLES]]).ravel(),
+            np.column_stack([speed, state[LINK_RATES]]).ravel(),
+            linkage.link_lengths, linkage.link_masses, *linkage.com_positions.T,
+            *(effects[name] for name in (
+                'joint_coulomb', 'joint_viscous', 'link_drag', 'link_spin_drag', 'gravity',
+                'smoothing')))
+        force = np.array(force)
+        force[2::3] += effects['link_torques'] - torques
+        inertia = np.diag(np.column_stack(
+            [linkage.link_masses, linkage.link_masses, linkage.link_inertias]).ravel())
+        whole = np.block([[inertia, jac.T], [jac, np.zeros((8, 8))]])
+        right = np.concatenate([force, -np.ravel(centripetal)])
+        return np.linalg.solve(whole, right)[:12].reshape(4, 3)
+
+    return solve
+
+
+@pytest.mark.parametrize('seed', range(40))
+def test_accelerations_agree_with_an_independent_model(
+    seed: int, random_linkage: Draw, random_state: Callable[..., Array],
+    maximal: Callable[..., Array],
+) -> None:
+    """Under all effects at once, the links' and that of the mass centre."""
+    rng = np.random.default_rng(seed)
+    linkage = random_linkage(rng)
+    state = travelling(rng, random_state(rng, linkage))
+    torques, effects = rng.uniform(-1.0, 1.0, 4), everything(rng)
+    ours = np.empty_like(state)
+    evaluate(state, torques, linkage.constants, surroundings(**effects), ours)
+    expected = maximal(linkage, state, torques, effects)
+    # Rounding times the condition number of 20 equations in units of order one.
+    size = np.abs(expected).max()
+    np.testing.assert_allclose(ours[LINK_RATES], expected[:, 2], rtol=0.0, atol=1e-11 * size)
+    np.testing.assert_allclose(
+        ours[CENTRE_VELOCITY], linkage.link_masses @ expected[:, :2] / linkage.link_masses.sum(),
+        rtol=0.0, atol=1e-11 * size)
+
+
+# --- What is refused --------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('name', 'size'), [
+    ('joint_coulomb', 4), ('joint_viscous', 4), ('link_drag', 4), ('link_spin_drag', 4),
+    ('gravity', 2), ('link_torques', 4)])
+@pytest.mark.parametrize('wrong', [(3,), (1,), (4, 4), (2, 1), (0,)])
+def test_wrong_shape_is_refused(name: str, size: int, wrong: tuple[int, ...]) -> None:
+    values: Any = {name: np.ones(wrong)}
+    with pytest.raises(ForceError) as refusal:
+        surroundings(**values)
+    assert str(refusal.value) == f'{name} must be one number or {size}, got shape {wrong}'
+
+
+@pytest.mark.parametrize(('given', 'word'), [
+    ({'joint_static_ratio': 0.5}, 'joint_static_ratio must be at least 1'),
+    ({'joint_static_ratio': np.nan}, 'joint_static_ratio must be at least 1'),
+    ({'stribeck_rate': 0.0}, 'stribeck_rate must be a positive rate'),
+    ({'stribeck_rate': np.inf}, 'stribeck_rate must be a positive rate')])
+def test_static_friction_that_cannot_be_is_refused(given: dict[str, float], word: str) -> None:
+    with pytest.raises(ForceError, match=word):
+        surroundings(joint_coulomb=1e-3, **given)  # type: ignore[arg-type]
+
+
+def test_dry_friction_falls_from_static_to_coulomb() -> None:
+    """Static at rest, half of the surplus at the Stribeck rate, Coulomb far beyond."""
+    for rate, expected in ((0.002, 1.5), (0.1, 1.25), (100.0, 1.0)):
+        assert rate * grip(rate, 1.5, 0.1, 1e-6) == pytest.approx(expected, rel=1e-3)
+        assert -rate * grip(-rate, 1.5, 0.1, 1e-6) == -rate * grip(rate, 1.5, 0.1, 1e-6)
+
+
+@pytest.mark.parametrize('wrong', ['heavy', [1.0, 'heavy', 1.0, 1.0], True, None])
+def test_what_is_no_number_is_refused(wrong: Any) -> None:
+    with pytest.raises(ForceError, match='joint_viscous must hold numbers, got '):
+        surroundings(joint_viscous=wrong)
+
+
+@pytest.mark.parametrize('name', ['joint_coulomb', 'joint_viscous', 'link_drag',
+                                  'link_spin_drag', 'link_torques'])
+@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
+def test_value_that_is_not_finite_is_refused(name: str, value: float) -> None:
+    values: Any = {name: [0.1, value, 0.1, 0.1]}
+    with pytest.raises(ForceError) as refusal:
+        surroundings(**values)
+    assert str(refusal.value) == f'{name} must be finite, got {value}'
+
+
+@pytest.mark.parametrize('name', ['joint_coulomb', 'joint_viscous', 'link_drag',
+                                  'link_spin_drag'])
+def test_friction_that_gives_energy_is_refused(name: str) -> None:
+    values: Any = {name: [0.1, 0.2, -0.5, 0.1]}
+    with pytest.raises(ForceError) as refusal:
+        surroundings(**values)
+    assert str(refusal.value) == f'{name} must not be negative, got -0.5'
+
+
+@pytest.mark.parametrize('smoothing', [0.0, -1e-4, np.inf, np.nan])
+def test_smoothing_must_be_positive(smoothing: float) -> None:
+    with pytest.raises(ForceError, match='smoothing must be a positive rate in rad/s, got '):
+        surroundings(joint_coulomb=1e-4, smoothing=smoothing)
+
+
+def test_errors_are_those_of_the_package() -> None:
+    assert issubclass(ForceError, FourbarError)
+
+
+def test_one_number_stands_for_all(paper: Mechanism) -> None:
+    start = two_pairs(0.6, -0.2)
+    one, four = (surroundings(joint_viscous=value, link_torques=value, gravity=other)
+                 for value, other in ((1e-6, 0.1), ([1e-6] * 4, [0.1, 0.1])))
+    np.testing.assert_array_equal(moved(paper, start, one, 10), moved(paper, start, four, 10))
+
+
+def test_effects_cannot_be_changed_afterwards() -> None:
+    around = surroundings(joint_viscous=1e-6)
+    with pytest.raises(ValueError, match='read-only'):
+        around.joint_viscous[0] = -1.0
