@@ -27,24 +27,40 @@ from bisect import insort
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, isnan, nan, pi
+from math import isfinite, pi, sin
 from typing import NamedTuple
 
-from fourbar_ros.estimation.filter import LinkageFilter, Snapshot
-from fourbar_ros.estimation.health import SensorHealth
-from fourbar_ros.mechanism import (
-    ClosureError,
-    JOINT_LINKS,
-    Mechanism,
-    nearest_assembly,
-    SENSOR_NAMES,
+from fourbar_ros.estimation.estimate import (
+    ACCEPTED,
+    Decision,
+    Estimate,
+    FAULTY,
+    GATED,
+    Innovation,
+    LATE,
+    NO_DATA,
+    NOT_FINITE,
+    REPEATS,
 )
-from fourbar_ros.mechanism.angles import wrap
-from fourbar_ros.mechanism.by_name import RejectedError, values_by_name
+from fourbar_ros.estimation.filter import (
+    Correction,
+    GYROS,
+    LEFT_OUT,
+    LinkageFilter,
+    REFUSED,
+    Snapshot,
+)
+from fourbar_ros.estimation.health import SensorHealth
+from fourbar_ros.estimation.layout import ANGLES, BIASES, RATES, TORQUES
+from fourbar_ros.estimation.measurement import Measurement, read_measurement
+from fourbar_ros.estimation.settings import EstimatorSettings
+from fourbar_ros.mechanism import ClosureError, Mechanism, nearest_assembly, SENSOR_NAMES
+from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.constrained import project_onto_closure
+from fourbar_ros.mechanism.reduced import NEAR_ALIGNMENT
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtri
+from numpy.typing import ArrayLike
 
 # A longer silence, or time going back, means another run of the device: start again.
 LONGEST_GAP_NS = 1_000_000_000
@@ -62,110 +78,23 @@ HISTORY_NS = 100_000_000
 LONGEST_QUEUE = 100
 
 STATE_NAMES = ('phi_a', 'phi_b', 'omega_a', 'omega_b')
-"""The state of the filter, by the names of docs/mechanics.md."""
+"""The free state of the filter, by the names of docs/mechanics.md."""
 
 # Standard deviations at the start of the rates, which are unknown [rad/s], and of the angles, so
 # large that the first sample is all that counts [rad].
 INITIAL_RATE_SIGMA = 10.0
 INITIAL_ANGLE_SIGMA = 0.5
 
+# Where wheels are not measured, their torques are known to their friction only: so much of what
+# the motors can give, walking in a second.
+UNKNOWN_SHARE = 0.02
 
-@dataclass(frozen=True)
-class EstimatorSettings:
-    """
-    What the filter assumes.
+# What drives the prediction.
+BY_SPEED, BY_EFFORT, BY_COMMAND, BY_NOTHING = (
+    'wheel speeds', 'wheel efforts', 'commanded efforts', 'nothing')
 
-    :param angle_noise: standard deviation of a link-angle sample [rad].
-    :param counts_per_turn: resolution of the link-angle sensors, 0 for none.
-    :param disturbance_torque: density of unknown torques on each link [N m/sqrt(Hz)].
-    :param gate_probability: share of the samples of a healthy sensor that are used; the rest lies
-        farther off than noise should have it.
-    """
-
-    angle_noise: float = 1.7453e-3
-    counts_per_turn: int = 16384
-    disturbance_torque: float = 1e-7
-    gate_probability: float = 0.9999
-
-    @property
-    def gate(self) -> float:
-        """Largest NIS of one sensor that is used: chi-square of one degree of freedom."""
-        return float(ndtri(0.5 + 0.5 * self.gate_probability) ** 2)
-
-    @property
-    def angle_variance(self) -> float:
-        """Variance of one sample, rounding included [rad^2]."""
-        step = 2.0 * pi / self.counts_per_turn if self.counts_per_turn else 0.0
-        return self.angle_noise ** 2 + step ** 2 / 12.0
-
-
-@dataclass(frozen=True, eq=False)
-class Innovation:
-    """
-    What one update of the filter saw.
-
-    :param sensors: which measured, as indices of `SENSOR_NAMES`.
-    :param angles: (n,) measured minus predicted [rad].
-    :param used: (n,) bool, False where the gate refused the sample.
-    :param nis: normalised square of the used ones, chi-square of as many degrees of freedom if
-        all is well.
-    """
-
-    sensors: tuple[int, ...]
-    angles: Array
-    used: NDArray[np.bool_]
-    nis: float
-
-    @property
-    def degrees_of_freedom(self) -> int:
-        """How many samples were used."""
-        return int(self.used.sum())
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """
-    The state of the links at a tick, and how well it is known.
-
-    :param stamp_ns: the tick [ns].
-    :param link_angles: (4,) continuous [rad].
-    :param link_rates: (4,) [rad/s].
-    :param angle_sigmas: (4,) one standard deviation [rad].
-    :param rate_sigmas: (4,) one standard deviation [rad/s].
-    :param covariance: (4, 4) of the filter's state, see `STATE_NAMES`.
-    :param innovation: of the newest measurement that arrived since the last tick and corrected
-        the filter, None without one.
-    """
-
-    stamp_ns: int
-    link_angles: Array
-    link_rates: Array
-    angle_sigmas: Array
-    rate_sigmas: Array
-    covariance: Array
-    innovation: Innovation | None
-
-
-class _Measurement(NamedTuple):
-    """Angles (n,) [rad] that some sensors measured, as they sort in time."""
-
-    stamp_ns: int
-    sensors: tuple[int, ...]
-    angles: Array
-
-    def link_angles(self) -> Array:
-        """Work out the link angles (4,) that follow without the closure, NaN the others [rad]."""
-        measured = dict(zip(self.sensors, self.angles.tolist()))
-        found = [measured.get(link, nan) for link in range(4)]
-        # Once around the loop from any link, either way.
-        for _ in range(3):
-            for sensor, (first, second) in enumerate(JOINT_LINKS, 4):
-                relative = measured.get(sensor, nan)
-                if isnan(found[second]):
-                    found[second] = found[first] + relative
-                if isnan(found[first]):
-                    found[first] = found[second] - relative
-        return np.array(found)
+# Link angles that should be near alignment are brought onto the closure by so many Newton steps.
+NEWTON_STEPS = 5
 
 
 @dataclass(eq=False)
@@ -176,15 +105,19 @@ class _Period:
     :param from_ns: the earlier tick, None before the first one [ns].
     :param to_ns: the later tick [ns].
     :param torques: (4,) If dOmega/dt of the wheels in between [N m].
+    :param unknown: how little these are known [N m/sqrt(s)].
     :param measurements: with stamps after the earlier tick and up to the later one, in order.
     :param before: what the filter was at the earlier tick.
+    :param reached: what it was at the later tick, before what was measured just then.
     """
 
     from_ns: int | None
     to_ns: int
     torques: Array
-    measurements: list[_Measurement]
+    unknown: float
+    measurements: list[Measurement]
     before: _Memory
+    reached: _Memory | None = None
 
 
 class _Memory(NamedTuple):
@@ -196,6 +129,14 @@ class _Memory(NamedTuple):
     starts: int
 
 
+class _Wheels(NamedTuple):
+    """What is known of the wheels at a tick: mean speeds over the period, and at its end."""
+
+    stamp_ns: int
+    speeds: Array | None
+    last: Array | None
+
+
 class Estimator:
     """
     Runs the filter on what comes in.
@@ -205,6 +146,8 @@ class Estimator:
     :ivar gated: number of samples that the gate refused, by sensor.
     :ivar starts: how often the filter was started.
     :ivar waiting_for: what is missing for a start, or '' while the filter runs.
+    :ivar driven_by: what the last prediction knew of the wheels: one of BY_SPEED, BY_EFFORT,
+        BY_COMMAND, BY_NOTHING.
     """
 
     def __init__(self, mechanism: Mechanism, settings: EstimatorSettings) -> None:
@@ -214,26 +157,33 @@ class Estimator:
         self._health = SensorHealth()
         self.starts = 0
         self.waiting_for = 'flywheel_states'
+        self.driven_by = BY_SPEED
         self._mechanism = mechanism
+        self._inertias = mechanism.flywheel_inertias
+        self._unknown = UNKNOWN_SHARE * float(mechanism.motor_torque_limits.max())
         self._settings = settings
-        self._gate = settings.gate
+        self._gate, self._variances = settings.gate, settings.variances
+        self._variances_of: dict[tuple[int, ...], Array] = {}
         self._filter: LinkageFilter | None = None
-        self._pending: list[_Measurement] = []
+        self._pending: list[Measurement] = []
         self._history: list[_Period] = []
         self._stamp_ns: int | None = None
         self._last_angles: Array | None = None
-        self._wheel_speeds = np.zeros(4)
+        self._rates: tuple[int, Array] | None = None
+        self._wheels: _Wheels | None = None
+        self._commanded: Array | None = None
         self._misfits = 0
         self._corrected_ns = 0
         self._lost = False
+        self._decisions: dict[int, Decision] = {}
         # Compile the kernels now, not while time runs.
         square = np.array([0.0, pi / 2.0, 0.0, pi / 2.0])
-        linkage = LinkageFilter(mechanism, square, 1.0, 1.0, 1.0)
+        linkage = LinkageFilter(mechanism, square, 1.0, 1.0, settings.randomness)
         linkage.move(1e-3, np.zeros(4))
         linkage.correct((0, 1, 2, 3), square, 1.0, self._gate)
-        linkage.sigmas()
 
-    def measure(self, stamp_ns: int, names: Sequence[str], angles: Sequence[float]) -> None:
+    def measure(self, stamp_ns: int, names: Sequence[str], angles: Sequence[float],
+                rates: Sequence[float] = ()) -> None:
         """
         Take measured angles; they are used at the next tick at or after their stamp.
 
@@ -243,53 +193,81 @@ class Estimator:
         :param names: any of `SENSOR_NAMES`.
         :param angles: orientation of each link, angle in each joint (second link relative to the
             first, any turn) [rad].
+        :param rates: of each from its gyro [rad/s], or nothing where none is fitted.
         :raises RejectedError: unusable, taken whole or not at all; also counted.
         """
         try:
-            measurement = self._checked(stamp_ns, names, angles)
+            measurement = read_measurement(stamp_ns, names, angles, rates)
+            self._check_time(measurement)
         except RejectedError as error:
-            self.rejected[error.kind] += 1
-            self.last_rejection = str(error)
+            self._reject(error)
+            if error.kind in ('finite', 'late'):
+                reason = LATE if error.kind == 'late' else NOT_FINITE
+                for name in names:
+                    self._decide(Decision(SENSOR_NAMES.index(name), reason))
             raise
         if alive := self._alive(measurement):
-            insort(self._pending, alive, key=_in_time)
+            insort(self._pending, alive, key=Measurement.in_time)
             del self._pending[:-LONGEST_QUEUE]
+
+    def commanded(self, efforts: Sequence[float]) -> None:
+        """
+        Take note of what the motors were told, for ticks that do not tell what they did.
+
+        :param efforts: (4,) torques on the wheels [N m]; others are no help, and are left alone.
+        """
+        if len(efforts) == 4 and all(map(isfinite, efforts)):
+            self._commanded = np.array(efforts, dtype=float)
 
     def sensor_faults(self) -> dict[str, str]:
         """Tell at the last tick what is wrong with sensors: a few words by the sensor's name."""
-        return {} if self._stamp_ns is None else self._health.faults(self._stamp_ns)
+        if self._stamp_ns is None:
+            return {}
+        found = {}
+        if self._filter is not None:
+            suspected = self._filter.suspected()
+            for sensor, error in suspected.items():
+                others = [SENSOR_NAMES[other] for other in suspected if other != sensor]
+                found[SENSOR_NAMES[sensor]] = _off_by(error, others)
+            for sensor, error in self._filter.faulty().items():
+                found[SENSOR_NAMES[sensor]] = _off_by(error, [])
+        found.update(self._health.faults(self._stamp_ns))
+        return found
 
-    def _alive(self, measurement: _Measurement) -> _Measurement | None:
+    def _alive(self, measurement: Measurement) -> Measurement | None:
         """Note the samples, and leave out those of a sensor that is stuck."""
-        stamp_ns, sensors, angles = measurement
-        for sensor, angle in zip(sensors, angles.tolist()):
-            self._health.sample(stamp_ns, sensor, angle)
-        kept = [n for n, sensor in enumerate(sensors) if not self._health.stuck(sensor)]
-        if len(kept) == len(sensors):
-            return measurement
-        if not kept:
-            return None
-        return _Measurement(stamp_ns, tuple(sensors[n] for n in kept), angles[kept])
+        stuck = set()
+        for sensor, angle in measurement.angles().items():
+            self._health.sample(measurement.stamp_ns, sensor, angle)
+            if self._health.stuck(sensor):
+                stuck.add(sensor)
+                self._decide(Decision(sensor, REPEATS))
+        return measurement.without(stuck) if stuck else measurement
 
-    def tick(self, stamp_ns: int, wheel_speeds: ArrayLike) -> Estimate | None:
+    def tick(self, stamp_ns: int, wheel_speeds: ArrayLike, wheel_efforts: ArrayLike = ()
+             ) -> Estimate | None:
         """
         Advance to a tick.
 
-        :param wheel_speeds: (4,) measured, relative to the links [rad/s].
+        Without speeds the efforts drive the prediction, and without these what was commanded.
+
+        :param wheel_speeds: (4,) measured, relative to the links, mean over the time since the
+            last tick [rad/s]; or nothing.
+        :param wheel_efforts: (4,) torques on the wheels in that time [N m]; or nothing.
         :returns: the estimate, or None while there is nothing to start from.
-        :raises RejectedError: wheel speeds that cannot be used, or a tick that was there
-            already; also counted.
+        :raises RejectedError: the tick was there already, or speeds or efforts are neither four
+            nor none; also counted.
         """
-        speeds = np.array(wheel_speeds, dtype=float)
+        speeds, efforts = (np.array(given, dtype=float) for given in (wheel_speeds, wheel_efforts))
         try:
-            self._check_tick(stamp_ns, speeds)
+            self._check_tick(stamp_ns, speeds, efforts)
         except RejectedError as error:
-            self.rejected[error.kind] += 1
-            self.last_rejection = str(error)
+            self._reject(error)
             raise
-        self._open_period(stamp_ns, speeds)
+        self._open_period(stamp_ns, speeds, efforts)
         innovation = self._relive(*self._sort_in())
         self._forget()
+        decisions = self._take_decisions()
         if self._filter is not None and stamp_ns - self._corrected_ns > LONGEST_BLIND_NS:
             self._lost = True
             self._begin_anew()
@@ -297,15 +275,35 @@ class Estimator:
         if self._filter is None:
             return None
         self.waiting_for = ''
-        angle_sigmas, rate_sigmas = self._filter.sigmas()
-        self._last_angles = self._filter.angles.copy()
-        return Estimate(stamp_ns, self._filter.angles.copy(), self._filter.rates, angle_sigmas,
-                        rate_sigmas, self._filter.P.copy(), innovation)
+        return self._estimate(self._filter, stamp_ns, innovation, decisions)
 
     def reset(self) -> None:
         """Forget the estimate and start again, on the same turn, from what is measured next."""
         self._pending.clear()
         self._begin_anew()
+
+    def _estimate(self, linkage: LinkageFilter, stamp_ns: int, innovation: Innovation | None,
+                  decisions: tuple[Decision, ...]) -> Estimate:
+        x, sigmas = linkage.x.copy(), linkage.sigmas()
+        self._last_angles, self._rates = x[ANGLES], (stamp_ns, x[RATES])
+        return Estimate(
+            stamp_ns, x[ANGLES], x[RATES], sigmas[ANGLES], sigmas[RATES], linkage.free_covariance,
+            x[TORQUES], sigmas[TORQUES],
+            {gyro - GYROS: float(bias) for gyro, bias in zip(linkage.gyros, x[BIASES:])},
+            innovation, decisions)
+
+    def _reject(self, error: RejectedError) -> None:
+        self.rejected[error.kind] += 1
+        self.last_rejection = str(error)
+
+    def _decide(self, decision: Decision) -> None:
+        self._decisions[decision.sensor] = decision
+
+    def _take_decisions(self) -> tuple[Decision, ...]:
+        """Return those since the last tick, of all sensors that were ever heard of."""
+        taken = tuple(self._decisions.values())
+        self._decisions = {sensor: Decision(sensor, NO_DATA) for sensor in self._decisions}
+        return taken
 
     def _begin_anew(self) -> None:
         self._filter, self._misfits = None, 0
@@ -313,31 +311,68 @@ class Estimator:
             # Where it goes back to, should something late come, is without a filter, too.
             last = self._history[-1]
             last.measurements.clear()
-            last.before = self._remember()
+            last.before, last.reached = self._remember(), None
             self._history[:] = [last]
 
     def _what_is_missing(self) -> str:
         if self._lost:
             return (f'link_angles: the estimate is lost, none was of use for '
                     f'{LONGEST_BLIND_NS * 1e-9:g} s')
-        return 'link_angles that tell link_a, link_b and one of link_c, link_d'
+        return 'link_angles that tell three of the four links'
 
-    def _open_period(self, stamp_ns: int, speeds: Array) -> None:
+    def _open_period(self, stamp_ns: int, speeds: Array, efforts: Array) -> None:
         """Add the period that ends with a tick; without a connection to the last, start anew."""
         last_ns = self._stamp_ns
-        torques = np.zeros(4)
-        if last_ns is not None:
-            if 0 < stamp_ns - last_ns <= LONGEST_GAP_NS:
-                torques = (self._mechanism.flywheel_inertias * (speeds - self._wheel_speeds)
-                           / ((stamp_ns - last_ns) * 1e-9))
-            else:
-                self._history.clear()
-                self._filter = last_ns = self._last_angles = None
-                self._health = SensorHealth()
-        self._stamp_ns, self._wheel_speeds = stamp_ns, speeds
-        self._history.append(_Period(last_ns, stamp_ns, torques, [], self._remember()))
+        if last_ns is not None and not 0 < stamp_ns - last_ns <= LONGEST_GAP_NS:
+            self._history.clear()
+            self._filter = last_ns = self._last_angles = self._rates = self._wheels = None
+            self._health = SensorHealth()
+            self._decisions.clear()
+        self._stamp_ns = stamp_ns
+        torques, unknown = self._wheel_torques(stamp_ns, last_ns, speeds, efforts)
+        self._history.append(_Period(last_ns, stamp_ns, torques, unknown, [], self._remember()))
 
-    def _sort_in(self) -> tuple[int, list[_Measurement]]:
+    def _wheel_torques(self, stamp_ns: int, last_ns: int | None, speeds: Array, efforts: Array
+                       ) -> tuple[Array, float]:
+        """
+        Work out what moved the wheels since the last tick, and how little that is known.
+
+        :returns: (4,) If dOmega/dt relative to the links [N m]; density of a random walk
+            [N m/sqrt(s)], 0 where it was measured.
+        """
+        before, elapsed = self._wheels, 0.0 if last_ns is None else (stamp_ns - last_ns) * 1e-9
+        last = None
+        if speeds.size:
+            last = speeds
+            if before is not None and before.speeds is not None:
+                # A mean over the period is the speed in its middle: half a period on.
+                last = speeds + 0.5 * (speeds - before.speeds)
+        self._wheels = _Wheels(stamp_ns, speeds if speeds.size else None, last)
+        if last_ns is None:
+            return np.zeros(4), 0.0
+        if last is not None and before is not None and before.last is not None:
+            self.driven_by = BY_SPEED
+            return self._inertias * (last - before.last) / elapsed, 0.0
+        given: Array | None = efforts if efforts.size else self._commanded
+        if given is None:
+            self.driven_by = BY_NOTHING
+            return np.zeros(4), self._unknown
+        self.driven_by = BY_EFFORT if efforts.size else BY_COMMAND
+        # The wheel has the link's acceleration already.
+        return given - self._inertias * self._accelerations(), self._unknown
+
+    def _accelerations(self) -> Array:
+        """Tell how the links were accelerated lately (4,) [rad/s^2]."""
+        if self._rates is None or not self._history:
+            return np.zeros(4)
+        period = self._history[-1]
+        memory = period.before
+        if memory.snapshot is None or period.from_ns is None:
+            return np.zeros(4)
+        rates: Array = self._rates[1] - memory.snapshot[0][RATES]
+        return rates / ((period.to_ns - period.from_ns) * 1e-9)
+
+    def _sort_in(self) -> tuple[int, list[Measurement]]:
         """
         Put what has arrived into the periods that it belongs to.
 
@@ -350,15 +385,20 @@ class Estimator:
         changed = len(history) - 1
         arrived, waiting = [], []
         for measurement in self._pending:
-            if measurement.stamp_ns > history[-1].to_ns + LONGEST_GAP_NS:
-                continue    # of another run
-            if measurement.stamp_ns > history[-1].to_ns:
+            ahead_ns = measurement.stamp_ns - history[-1].to_ns
+            if ahead_ns > LONGEST_GAP_NS:
+                self._reject(RejectedError(
+                    'future', f'measured {ahead_ns * 1e-9:g} s after the tick, limit '
+                              f'{LONGEST_GAP_NS * 1e-9:g} s'))
+            elif ahead_ns > 0:
                 waiting.append(measurement)
-            elif measurement.stamp_ns > oldest_ns:     # else of another run
+            elif measurement.stamp_ns > oldest_ns:
                 n = self._period_of(measurement.stamp_ns)
-                insort(history[n].measurements, measurement, key=_in_time)
+                insort(history[n].measurements, measurement, key=Measurement.in_time)
                 arrived.append(measurement)
                 changed = min(changed, n)
+            else:
+                self._reject(RejectedError('late', 'measured before all that is remembered'))
         self._pending = waiting
         return changed, arrived
 
@@ -369,43 +409,70 @@ class Estimator:
             n -= 1
         return n
 
-    def _relive(self, first: int, arrived: list[_Measurement]) -> Innovation | None:
+    def _relive(self, first: int, arrived: list[Measurement]) -> Innovation | None:
         """
         Bring the filter from the beginning of a period to the last tick.
 
         :param first: number of the period.
-        :param arrived: measurements that the filter has not seen before.
+        :param arrived: measurements that the filter has not seen before, the oldest in it.
         :returns: innovation of the newest of these that corrected the filter.
         """
         self.waiting_for = self._what_is_missing()
+        period = self._history[first]
+        now_ns = period.from_ns
         if first < len(self._history) - 1:
-            self._recall(self._history[first].before)
+            if period.reached is not None and arrived[0].stamp_ns == period.to_ns:
+                # All else in that period is as it was.
+                self._recall(period.reached)
+                now_ns = period.to_ns
+            else:
+                self._recall(period.before)
         innovation = None
         for n in range(first, len(self._history)):
             period = self._history[n]
             if n > first:
-                period.before = self._remember()
-            now_ns = period.from_ns
-            for measurement in period.measurements:
-                if self._filter is not None and now_ns is not None and (
-                        measurement.stamp_ns > now_ns):
-                    self._filter.move((measurement.stamp_ns - now_ns) * 1e-9, period.torques)
-                now_ns = measurement.stamp_ns
-                seen = self._use(measurement)
-                if seen is not None and any(new is measurement for new in arrived):
-                    innovation = seen
-                    self._note_refusals(seen)
-            if self._filter is not None and now_ns is not None and now_ns < period.to_ns:
-                self._filter.move((period.to_ns - now_ns) * 1e-9, period.torques)
+                period.before, now_ns = self._remember(), period.from_ns
+            innovation = self._live(period, now_ns, arrived) or innovation
         return innovation
 
-    def _note_refusals(self, seen: Innovation) -> None:
-        """Count the samples that the gate refused."""
-        used = seen.used.tolist()
-        self._health.judged(seen.sensors, used)
-        if not all(used):
-            self.gated.update(SENSOR_NAMES[sensor] for sensor, taken in zip(seen.sensors, used)
-                              if not taken)
+    def _live(self, period: _Period, now_ns: int | None, arrived: list[Measurement]
+              ) -> Innovation | None:
+        """Bring the filter through a period, from a time in it; parameters as of _relive."""
+        innovation, to_ns = None, period.to_ns
+        skipped = now_ns == to_ns
+        for measurement in period.measurements:
+            stamp_ns = measurement.stamp_ns
+            if skipped and stamp_ns < to_ns:
+                continue
+            if stamp_ns == to_ns and now_ns != to_ns:
+                self._move(period, now_ns, to_ns)
+                now_ns, period.reached = to_ns, self._remember()
+            elif stamp_ns != to_ns:
+                self._move(period, now_ns, stamp_ns)
+                now_ns = stamp_ns
+            seen = self._use(measurement)
+            if seen is not None and any(new is measurement for new in arrived):
+                innovation = self._note(measurement, seen)
+        if now_ns != to_ns:
+            self._move(period, now_ns, to_ns)
+            period.reached = self._remember()
+        return innovation
+
+    def _move(self, period: _Period, from_ns: int | None, to_ns: int) -> None:
+        if self._filter is not None and from_ns is not None and from_ns < to_ns:
+            self._filter.move((to_ns - from_ns) * 1e-9, period.torques, period.unknown)
+
+    def _note(self, measurement: Measurement, seen: Correction) -> Innovation:
+        """Take note of what became of samples that the filter saw for the first time."""
+        sensors = measurement.sensors
+        for sensor, fate, square in zip(sensors, seen.fate.tolist(), seen.squares.tolist()):
+            if fate == REFUSED:
+                self.gated[_name(sensor)] += 1
+            if sensor < GYROS:
+                self._health.judged(sensor, fate == REFUSED)
+                reason = {REFUSED: GATED, LEFT_OUT: FAULTY}.get(fate, ACCEPTED)
+                self._decide(Decision(sensor, reason, square))
+        return Innovation(sensors, seen.innovation, seen.used, seen.nis)
 
     def _forget(self) -> None:
         """Drop the periods that nothing which is still accepted can belong to."""
@@ -426,33 +493,39 @@ class Estimator:
         if memory.linkage is not None and memory.snapshot is not None:
             memory.linkage.restore(memory.snapshot)
 
-    def _use(self, measurement: _Measurement) -> Innovation | None:
+    def _use(self, measurement: Measurement) -> Correction | None:
         """Correct the filter, or start it."""
         if self._filter is None:
             self._start(measurement)
             return None
-        residual, nis, used = self._filter.correct(
-            measurement.sensors, measurement.angles, self._settings.angle_variance, self._gate)
-        if used.any():
+        seen = self._filter.correct(
+            measurement.sensors, measurement.values, self._variances_for(measurement.sensors),
+            self._gate)
+        used = int(seen.used.sum())
+        if used:
             self._corrected_ns = max(self._corrected_ns, measurement.stamp_ns)
-        if 2 * used.sum() >= used.size:
+        if 2 * used >= len(seen.fate):
             self._misfits = 0
         else:
             self._misfits += 1
             if self._misfits >= LOST_AFTER:
                 # If this one does not tell enough, the wheels carry on.
                 self._start(measurement)
-        return Innovation(measurement.sensors, residual, used, nis)
+        return seen
 
-    def _start(self, measurement: _Measurement) -> None:
+    def _variances_for(self, sensors: tuple[int, ...]) -> Array:
+        found = self._variances_of.get(sensors)
+        if found is None:
+            found = self._variances_of[sensors] = self._variances[list(sensors)]
+        return found
+
+    def _start(self, measurement: Measurement) -> None:
         """Start the filter from a sample, if it determines the configuration."""
         measured = measurement.link_angles()
-        known = ~np.isnan(measured)
-        if not (known[0] and known[1] and known.sum() > 2):
+        if np.isfinite(measured).sum() < 3:
             return
-        near = np.where(np.isnan(measured), measured[[2, 3, 3, 2]], measured)
         try:
-            start = nearest_assembly(self._mechanism, (0, 1), (measured[0], measured[1]), near)
+            start = self._assembled(measured)
         except ClosureError as error:
             self.waiting_for = f'link angles that fit together: {error}'
             return
@@ -461,36 +534,62 @@ class Estimator:
             start += 2.0 * pi * np.round((self._last_angles - start) / (2.0 * pi))
         self._filter = LinkageFilter(
             self._mechanism, start, INITIAL_ANGLE_SIGMA ** 2, INITIAL_RATE_SIGMA ** 2,
-            self._settings.disturbance_torque)
+            self._settings.randomness)
         self._filter.correct(
-            measurement.sensors, measurement.angles, self._settings.angle_variance)
+            measurement.sensors, measurement.values, self._variances_for(measurement.sensors))
         self._corrected_ns, self._lost = measurement.stamp_ns, False
         self.starts += 1
         self._misfits = 0
 
-    def _checked(self, stamp_ns: int, names: Sequence[str], angles: Sequence[float]
-                 ) -> _Measurement:
-        measured = values_by_name(names, angles, SENSOR_NAMES, 'position')
-        sensors = tuple(sorted(measured))
-        known = self._pending
+    def _assembled(self, measured: Array) -> Array:
+        """
+        Return link angles on the closure that are near measured ones.
+
+        :param measured: (4,), one of them NaN where it is not known [rad].
+        :raises ClosureError: there are none.
+        """
+        if abs(sin(measured[3] - measured[2])) < NEAR_ALIGNMENT:
+            # Two angles do not tell the others here, but four tell what they are.
+            angles, rates = tuple(measured.tolist()), (0.0, 0.0, 0.0, 0.0)
+            constants = self._mechanism.with_rigid_joints().constants
+            for _ in range(NEWTON_STEPS):
+                angles, _ = project_onto_closure(angles, rates, constants, True)
+            return np.array(angles)
+        partners = measured[[2, 3, 0, 1]]
+        near = np.where(np.isnan(measured), partners, measured)
+        known = [link for link in range(4) if not np.isnan(measured[link])]
+        # Two that are not opposite: opposite ones may say the same.
+        pair = (known[0], known[1]) if known[1] - known[0] != 2 else (known[0], known[2])
+        return nearest_assembly(
+            self._mechanism, pair, (measured[pair[0]], measured[pair[1]]), near)
+
+    def _check_time(self, measurement: Measurement) -> None:
+        """Refuse what comes too late, and what came already."""
+        stamp_ns, known = measurement.stamp_ns, self._pending
         if self._stamp_ns is not None and 0 <= self._stamp_ns - stamp_ns < LONGEST_GAP_NS:
             if self._stamp_ns - stamp_ns > HISTORY_NS:
                 raise RejectedError('late', f'measured {(self._stamp_ns - stamp_ns) * 1e-9:g} s '
                                             f'before the last tick, limit {HISTORY_NS * 1e-9:g} s')
             known = known + self._history[self._period_of(stamp_ns)].measurements
         for other in known:
-            if other.stamp_ns == stamp_ns and not set(sensors).isdisjoint(other.sensors):
+            if other.stamp_ns == stamp_ns and not set(measurement.sensors).isdisjoint(
+                    other.sensors):
                 raise RejectedError('repeated', 'a sample with this stamp was there already')
-        return _Measurement(
-            stamp_ns, sensors, np.array([wrap(measured[sensor]) for sensor in sensors]))
 
-    def _check_tick(self, stamp_ns: int, speeds: Array) -> None:
-        if speeds.shape != (4,) or not all(map(isfinite, speeds.tolist())):
-            raise RejectedError('wheels', 'flywheel_states must hold four finite velocities')
+    def _check_tick(self, stamp_ns: int, speeds: Array, efforts: Array) -> None:
+        for quantity, values in (('velocities', speeds), ('efforts', efforts)):
+            if values.size and not (values.shape == (4,) and all(map(isfinite, values.tolist()))):
+                raise RejectedError('wheels', f'flywheel_states must hold four finite {quantity}')
         if self._stamp_ns is not None and 0 <= self._stamp_ns - stamp_ns < LONGEST_GAP_NS:
             raise RejectedError('stamp', 'tick is not newer than the last one')
 
 
-def _in_time(measurement: _Measurement) -> tuple[int, tuple[int, ...]]:
-    """Sort by stamp, and samples of one stamp in an order that arrival has no part in."""
-    return measurement.stamp_ns, measurement.sensors
+def _name(sensor: int) -> str:
+    """Return the name of a sensor, or of a gyro."""
+    return SENSOR_NAMES[sensor] if sensor < GYROS else f'gyro_{SENSOR_NAMES[sensor - GYROS]}'
+
+
+def _off_by(error: float, others: list[str]) -> str:
+    """Say how far a sensor is off [rad], or one of the others is."""
+    said = f'off by {np.degrees(error):.2g} deg'
+    return f'{said}, or {" or ".join(others)} is' if others else said

@@ -13,329 +13,261 @@
 # limitations under the License.
 
 """
-Extended Kalman filter of the linkage, x = (phi_a, phi_b, omega_a, omega_b).
+Extended Kalman filter of the linkage.
 
 Process model: the linkage's own dynamics, driven by what the wheels were measured to do. With
 the motor torque `tau = If (alpha + dOmega/dt)` eliminated, the links move as if each carried its
-wheel locked to it, under the forces `-If dOmega/dt` (docs/estimation.md).
-
-Phi_c and phi_d follow by closure, continuously, on the branch that the filter was started on.
-Gamma, which links them to the state, does not exist at a change point; close to one the last
-good Gamma is kept, which is exact for a parallelogram.
+wheel locked to it, under the forces `-If dOmega/dt` and two disturbance torques, which walk at
+random (docs/estimation.md). What is in the state tells estimation.layout.
 """
 
 from __future__ import annotations
 
-from math import inf, pi, sin, sqrt
+from math import inf, sqrt
+from typing import NamedTuple
 
 from filterpy.kalman import ExtendedKalmanFilter
-from fourbar_ros.mechanism import JOINT_LINKS, Mechanism
-from fourbar_ros.mechanism.compiled import kernel
-from fourbar_ros.mechanism.constants import Array, Constants
-from fourbar_ros.mechanism.dynamics import gamma_matrix, mass_matrix
-from fourbar_ros.mechanism.forces import NOTHING
+from fourbar_ros.estimation.correction import correct, LEFT_OUT, REFUSED, USED
+from fourbar_ros.estimation.layout import ANGLES, BIASES, FREE, RATES, TORQUES
+from fourbar_ros.estimation.prediction import near_change_point, predict
+from fourbar_ros.estimation.suspicion import BIAS, FAULTY, no_suspicions, SUSPECTED, VERDICT
+from fourbar_ros.mechanism import JOINT_LINKS, Mechanism, SENSOR_NAMES
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.dynamics import gamma_matrix
 from fourbar_ros.mechanism.layout import STATE_SIZE
-from fourbar_ros.mechanism.motion import advance_state, meet_closure
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-# Below this |sin(phi_d - phi_c)| the last good Gamma is kept: it divides by that sine.
-GAMMA_IS_LOST = 0.05
-
-# Half width of the central differences for the transition matrix [rad], [rad/s].
-DIFFERENCE = 1e-6
-
-
-# What each of SENSOR_NAMES makes of the four link angles.
+# What each of SENSOR_NAMES makes of the four links, in angles and in rates.
 SENSOR_ROWS = np.vstack([np.eye(4), np.zeros((4, 4))])
 for _row, (_first, _second) in enumerate(JOINT_LINKS, 4):
     SENSOR_ROWS[_row, [_first, _second]] = -1.0, 1.0
 
-Snapshot = tuple[Array, Array, Array, Array]
+GYROS = len(SENSOR_NAMES)
+"""Number of the gyro of the first of SENSOR_NAMES; the others follow."""
+
+# Of what the links of a parallelogram, the one with the least to tell, tell of a and b.
+_PARTNERS = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
+
+# Standard deviations at the start: of the bias of a gyro [rad/s]; the disturbance torques are as
+# if they had walked for so long [s].
+INITIAL_BIAS_SIGMA = 0.1
+WALKED_BEFORE = 10.0
+
+Snapshot = tuple[Array, Array, Array, tuple[int, ...]]
+
+
+class Randomness(NamedTuple):
+    """
+    What acts on the linkage at random, as densities.
+
+    :param torque: of white torques on each link [N m/sqrt(Hz)].
+    :param torque_walk: of the disturbance torques on links a and b [N m/sqrt(s)].
+    :param gyro_walk: of the biases of gyros [rad/s/sqrt(s)].
+    """
+
+    torque: float
+    torque_walk: float = 0.0
+    gyro_walk: float = 0.0
+
+
+class Correction(NamedTuple):
+    """
+    What a correction saw.
+
+    :param innovation: (m,) measured minus predicted [rad] or [rad/s].
+    :param nis: normalised square of those that were used.
+    :param squares: (m,) square of each over its variance.
+    :param fate: (m,) what became of each: `USED`, `REFUSED` by the gate, `LEFT_OUT` as that of a
+        faulty sensor (estimation.correction).
+    """
+
+    innovation: Array
+    nis: float
+    squares: Array
+    fate: NDArray[np.int64]
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Tell which were used (m,)."""
+        return self.fate == USED
+
+
+class _Layout(NamedTuple):
+    """How a set of sensors sees the state."""
+
+    sensors: NDArray[np.int64]
+    rows: Array
+    spared: NDArray[np.bool_]
 
 
 class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
     """
-    The filter proper: predict with wheel motion, correct with link angles.
+    The filter proper: predict with wheel motion, correct with measured angles and rates.
 
     State, covariances, gain and innovation are filterpy's attributes. Its two steps are done by
-    compiled kernels, which take a third of the time.
+    compiled kernels.
 
-    :ivar angles: (4,) link angles that belong to x, continuous [rad].
     :param mechanism: the linkage.
-    :param angles: (4,) initial link angles on the closure [rad].
-    :param angle_variance: of phi_a and phi_b at the start [rad^2].
-    :param rate_variance: of the rates, assumed zero, at the start [rad^2/s^2].
-    :param disturbance: density of the random torque on each link [N m/sqrt(Hz)].
+    :param angles: (4,) initial link angles on the closure, continuous [rad].
+    :param angle_variance: of phi_a and phi_b at the start, near a change point of all [rad^2].
+    :param rate_variance: of the rates, assumed zero, likewise [rad^2/s^2].
+    :param randomness: what acts on the linkage.
     """
 
     def __init__(self, mechanism: Mechanism, angles: Array, angle_variance: float,
-                 rate_variance: float, disturbance: float) -> None:
-        super().__init__(dim_x=4, dim_z=4)
+                 rate_variance: float, randomness: Randomness) -> None:
+        super().__init__(dim_x=BIASES, dim_z=4)
         # An array of one: a record by itself takes longer to hand to a kernel than it runs.
         self._constants = np.array(
             [mechanism.with_rigid_joints().constants_with(np.ones(4, dtype=bool))])
-        self._disturbance = disturbance
+        self._lengths = mechanism.link_lengths
+        self._densities = np.array(randomness)
         self._state = np.zeros(STATE_SIZE)
-        self.angles = np.array(angles)
-        self._to_links = np.vstack([np.eye(2), np.eye(2)])
-        if abs(sin(angles[3] - angles[2])) > GAMMA_IS_LOST:
-            self._to_links[2:] = gamma_matrix(self.angles, mechanism.link_lengths)
-        self.x = np.array([angles[0], angles[1], 0.0, 0.0])
-        self.P = np.diag([angle_variance, angle_variance, rate_variance, rate_variance])
+        self._gyros: tuple[int, ...] = ()
+        self._layouts: dict[tuple[int, ...], _Layout] = {}
+        self.x = np.zeros(BIASES)
+        self.x[ANGLES] = angles
+        self.P = np.zeros((BIASES, BIASES))
+        links = np.eye(4)
+        if not near_change_point(self.x):
+            links = self._after_two()
+        self.P[ANGLES, ANGLES] = angle_variance * links @ links.T
+        self.P[RATES, RATES] = rate_variance * links @ links.T
+        self.P[TORQUES, TORQUES] = WALKED_BEFORE * randomness.torque_walk ** 2 * np.eye(2)
+        self._suspicions = no_suspicions(len(SENSOR_NAMES), BIASES)
 
     @property
-    def gamma(self) -> Array:
-        """Return Gamma in use (2, 2): (omega_c, omega_d) = Gamma (omega_a, omega_b)."""
-        return self._to_links[2:]
+    def angles(self) -> Array:
+        """Return the angles of all four links, continuous (4,) [rad]."""
+        angles: Array = self.x[ANGLES]
+        return angles
 
     @property
     def rates(self) -> Array:
         """Return the rates of all four links (4,) [rad/s]."""
-        rates: Array = self._to_links @ self.x[2:]
+        rates: Array = self.x[RATES]
         return rates
 
-    def sigmas(self) -> tuple[Array, Array]:
-        """Return one standard deviation of the four angles [rad] and rates [rad/s]: two (4,)."""
-        return link_sigmas(self.P, self._to_links)
+    @property
+    def disturbance(self) -> Array:
+        """Return the disturbance torques on links a and b (2,) [N m]."""
+        torques: Array = self.x[TORQUES]
+        return torques
+
+    @property
+    def gyros(self) -> tuple[int, ...]:
+        """Return the gyros whose biases are in the state, in their order."""
+        return self._gyros
+
+    @property
+    def free_covariance(self) -> Array:
+        """Return the covariance of (phi_a, phi_b, omega_a, omega_b): (4, 4)."""
+        covariance: Array = self.P[FREE[:, None], FREE]
+        return covariance
+
+    def sigmas(self) -> Array:
+        """Return one standard deviation of each number of the state (n,)."""
+        sigmas: Array = np.sqrt(self.P.diagonal())
+        return sigmas
+
+    def faulty(self) -> dict[int, float]:
+        """Return the errors [rad] of sensors that are left out, by index of `SENSOR_NAMES`."""
+        return self._with_verdict(FAULTY)
+
+    def suspected(self) -> dict[int, float]:
+        """Return the errors [rad] of sensors of which one, at least, is wrong, likewise."""
+        return self._with_verdict(SUSPECTED)
 
     def snapshot(self) -> Snapshot:
         """Return a copy of what move and correct change, for :meth:`restore`."""
-        return self.x.copy(), self.P.copy(), self.angles.copy(), self._to_links.copy()
+        return self.x.copy(), self.P.copy(), self._suspicions.copy(), self._gyros
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot."""
-        self.x, self.P, self.angles, self._to_links = (array.copy() for array in snapshot)
+        x, covariance, suspicions, gyros = snapshot
+        self.x, self.P, self._suspicions = x.copy(), covariance.copy(), suspicions.copy()
+        if gyros != self._gyros:
+            self._gyros = gyros
+            self._layouts.clear()
+            self._resize()
 
-    def move(self, duration: float, wheel_torques: Array) -> None:
+    def move(self, duration: float, wheel_torques: Array, unknown_torque: float = 0.0) -> None:
         """
         Predict over a time in which the wheels were accelerated evenly.
 
         :param duration: [s].
         :param wheel_torques: (4,) If dOmega/dt, the wheels' measured relative motion [N m].
+        :param unknown_torque: how much less they are known than measured ones, as a random walk
+            of the disturbance torques [N m/sqrt(s)].
         """
-        predict(self.x, self.P, self.angles, self._to_links, wheel_torques, duration,
-                self._disturbance, self._constants, self._state, self.F, self.Q)
+        densities = self._densities
+        if unknown_torque:
+            densities = densities.copy()
+            densities[1] = sqrt(densities[1] ** 2 + unknown_torque ** 2)
+        predict(self.x, self.P, self._suspicions, wheel_torques, duration, densities,
+                self._constants, self._state, self.F, self.Q)
 
-    def correct(self, sensors: tuple[int, ...], measured: Array, variance: float,
-                gate: float = inf) -> tuple[Array, float, NDArray[np.bool_]]:
+    def correct(self, sensors: tuple[int, ...], measured: Array, variance: ArrayLike,
+                gate: float = inf) -> Correction:
         """
-        Update with measured angles of links and joints, those left out that are far off.
+        Update with what sensors measured, samples left out that are far off.
 
-        S, its inverse and K are those of the sensors that were used; y has all.
+        S, its inverse and K are those of the samples that were used; y has all.
 
-        :param sensors: which were measured, as indices of `SENSOR_NAMES`.
-        :param measured: (n,) their angles, any turn [rad].
-        :param variance: of each [rad^2].
-        :param gate: largest normalised square of a sensor's innovation that is used.
-        :returns: the wrapped innovations (n,) [rad], the normalised square (NIS) of those that
-            were used, and which were (n,).
+        :param sensors: which were measured, as indices of `SENSOR_NAMES`, and from `GYROS` on
+            their gyros.
+        :param measured: (m,) their angles, any turn [rad], or rates [rad/s].
+        :param variance: of each, (m,) or one for all [rad^2] or [rad^2/s^2].
+        :param gate: largest normalised square of an innovation that is used.
         """
-        self.y, self.S, self.SI, self.K, nis, used = correct(
-            self.x, self.P, self.angles, self._to_links, np.array(sensors), measured, variance,
-            gate, self._constants, self._state)
-        return self.y, nis, used
+        layout = self._layouts.get(sensors)
+        if layout is None:
+            layout = self._layouts[sensors] = self._layout(sensors)
+        variances = np.empty(len(sensors))
+        variances[:] = variance
+        self.y, squares, self.S, self.SI, self.K, nis, fate = correct(
+            self.x, self.P, self._suspicions, layout.sensors, layout.rows, measured, variances,
+            gate, layout.spared, self._constants, self._state)
+        return Correction(self.y, nis, squares, fate)
 
+    def _after_two(self) -> Array:
+        """Return what all four rates are after those of links a and b (4, 2)."""
+        return np.vstack([np.eye(2), gamma_matrix(self.x, self._lengths)])
 
-@kernel
-def predict(x: Array, covariance: Array, angles: Array, to_links: Array, wheel_torques: Array,
-            duration: float, disturbance: float, boxed: NDArray[np.record], state: Array,
-            transition: Array, noise: Array) -> None:
-    """
-    Predict in place: filterpy's `predict` with the linkage as the model.
+    def _with_verdict(self, verdict: float) -> dict[int, float]:
+        found = np.flatnonzero(self._suspicions[:, VERDICT] == verdict)
+        return {int(sensor): float(self._suspicions[sensor, BIAS]) for sensor in found}
 
-    :param x, covariance: (4,) and (4, 4), the filter's.
-    :param angles: (4,) link angles that belong to x [rad].
-    :param to_links: (4, 2) from links a, b to all four; its lower half is Gamma.
-    :param boxed: (1,) constants of the mechanism.
-    :param transition, noise: (4, 4) receive F and Q.
-    """
-    constants = boxed[0]
-    gamma = to_links[2:]
-    linearise(angles, x[2:], gamma, wheel_torques, duration, disturbance, constants,
-              state, transition, noise)
-    move_links(angles, x[2:], gamma, wheel_torques, duration, constants, state)
-    # P = F P F' + Q
-    covariance[:] = transition @ covariance @ transition.T + noise
-    _take_over(state, x, angles, to_links, constants.lengths)
-
-
-@kernel
-def correct(x: Array, covariance: Array, angles: Array, to_links: Array,
-            sensors: NDArray[np.int64], measured: Array, variance: float, gate: float,
-            boxed: NDArray[np.record], state: Array
-            ) -> tuple[Array, Array, Array, Array, float, NDArray[np.bool_]]:
-    """
-    Correct in place: filterpy's `update`, with wrapped innovations.
-
-    Parameters as in :func:`predict` and :meth:`LinkageFilter.correct`.
-
-    :returns: y (n,); of the m sensors within the gate S (m, m), its inverse, K (4, m) and the
-        normalised innovation squared; and which they are (n,).
-    """
-    constants = boxed[0]
-    count = sensors.size
-    jacobian = np.zeros((count, 4))
-    y = np.empty(count)
-    for row in range(count):
-        predicted = 0.0
-        for link in range(4):
-            share = SENSOR_ROWS[sensors[row], link]
-            predicted += share * angles[link]
-            jacobian[row, 0] += share * to_links[link, 0]
-            jacobian[row, 1] += share * to_links[link, 1]
-        y[row] = pi - (pi - measured[row] + predicted) % (2.0 * pi)
-    # S = H P H' + R, K = P H' S^-1
-    s = jacobian @ covariance @ jacobian.T + variance * np.eye(count)
-    used = np.empty(count, np.bool_)
-    many = 0
-    for row in range(count):
-        used[row] = y[row] * y[row] <= gate * s[row, row]
-        many += used[row]
-    if many == 0:
-        nothing = np.zeros((0, 0))
-        return y, nothing, nothing, np.zeros((4, 0)), 0.0, used
-    good = y
-    if many < count:
-        good, jacobian = y[used], jacobian[used]
-        s = jacobian @ covariance @ jacobian.T + variance * np.eye(many)
-    noise = variance * np.eye(many)
-    inverse = np.linalg.inv(s)
-    gain = covariance @ jacobian.T @ inverse
-    change = gain @ good
-    x += change
-    # P = (I - K H) P (I - K H)' + K R K'
-    rest = np.eye(4) - gain @ jacobian
-    covariance[:] = rest @ covariance @ rest.T + gain @ noise @ gain.T
-    state[0:4] = angles + to_links @ change[:2]
-    state[4:8] = to_links @ x[2:]
-    meet_closure(state, constants)
-    _take_over(state, x, angles, to_links, constants.lengths)
-    return y, s, inverse, gain, float(good @ inverse @ good), used
-
-
-@kernel
-def link_sigmas(covariance: Array, to_links: Array) -> tuple[Array, Array]:
-    """Evaluate one standard deviation of angles and rates of the four links: two (4,)."""
-    sigmas = np.empty((2, 4))
-    for half in range(2):
-        first = 2 * half
-        for link in range(4):
-            a, b = to_links[link, 0], to_links[link, 1]
-            sigmas[half, link] = sqrt(
-                a * a * covariance[first, first] + b * b * covariance[first + 1, first + 1]
-                + a * b * (covariance[first, first + 1] + covariance[first + 1, first]))
-    return sigmas[0], sigmas[1]
-
-
-@kernel
-def _take_over(state: Array, x: Array, angles: Array, to_links: Array, lengths: Array) -> None:
-    """Set x and what belongs to it from angles and rates of the links."""
-    angles[:] = state[0:4]
-    x[:2] = state[0:2]
-    x[2:] = state[4:6]
-    if abs(sin(angles[3] - angles[2])) > GAMMA_IS_LOST:
-        to_links[2:] = gamma_matrix(angles, lengths)
-
-
-@kernel
-def move_links(angles: Array, rates: Array, gamma: Array, wheel_torques: Array, duration: float,
-               constants: Constants, state: Array) -> None:
-    """
-    Integrate the links, wheels locked, under minus the torques that moved the wheels.
-
-    :param angles: (4,) [rad].
-    :param rates: (2,) of links a and b [rad/s].
-    :param state: (STATE_SIZE,) receives angles and rates of the links.
-    """
-    state[:] = 0.0
-    state[0:4] = angles
-    state[4:6] = rates
-    state[6] = gamma[0, 0] * rates[0] + gamma[0, 1] * rates[1]
-    state[7] = gamma[1, 0] * rates[0] + gamma[1, 1] * rates[1]
-    advance_state(state, wheel_torques, wheel_torques, wheel_torques, duration, constants, NOTHING)
-
-
-@kernel
-def linearise(
-    angles: Array, rates: Array, gamma: Array, wheel_torques: Array, duration: float,
-    disturbance: float, constants: Constants, state: Array, transition: Array, noise: Array,
-) -> None:
-    """
-    Evaluate transition matrix and process noise of :func:`move_links`.
-
-    :param transition: (4, 4) receives d x(end) / d x(start).
-    :param noise: (4, 4) receives the covariance that random link torques of density
-        `disturbance` [N m/sqrt(Hz)] leave after `duration`.
-    """
-    trial_angles, trial_rates, trial_gamma = np.empty(4), np.empty(2), gamma.copy()
-    for column in range(4):
-        for sign in (1.0, -1.0):
-            trial_angles[:] = angles
-            trial_rates[:] = rates
-            if column < 2:
-                trial_angles[column] += sign * DIFFERENCE
-                trial_angles[2] += sign * DIFFERENCE * gamma[0, column]
-                trial_angles[3] += sign * DIFFERENCE * gamma[1, column]
-                if abs(sin(angles[3] - angles[2])) > GAMMA_IS_LOST:
-                    trial_gamma[:] = gamma_matrix(trial_angles, constants.lengths)
+    def _layout(self, sensors: tuple[int, ...]) -> _Layout:
+        for gyro in sensors:
+            if gyro >= GYROS and gyro not in self._gyros:
+                self._add_gyro(gyro)
+        rows = np.zeros((len(sensors), len(self.x)))
+        for row, sensor in zip(rows, sensors):
+            if sensor < GYROS:
+                row[ANGLES] = SENSOR_ROWS[sensor]
             else:
-                trial_gamma[:] = gamma
-                trial_rates[column - 2] += sign * DIFFERENCE
-            move_links(trial_angles, trial_rates, trial_gamma, wheel_torques, duration, constants,
-                       state)
-            for row in range(4):
-                # Angles a, b are state[0:2], rates a, b are state[4:6].
-                end = state[row] if row < 2 else state[row + 2]
-                if sign > 0.0:
-                    transition[row, column] = end
-                else:
-                    transition[row, column] -= end
-                    transition[row, column] /= 2.0 * DIFFERENCE
-    _process_noise(angles, gamma, duration, disturbance, constants, noise)
+                row[RATES] = SENSOR_ROWS[sensor - GYROS]
+                row[BIASES + self._gyros.index(sensor)] = 1.0
+        spared = np.ones(len(SENSOR_NAMES), np.bool_)
+        angles = [sensor for sensor in sensors if sensor < GYROS]
+        for sensor in angles:
+            others = SENSOR_ROWS[[other for other in angles if other != sensor]] @ _PARTNERS
+            spared[sensor] = np.linalg.matrix_rank(others) < 2 if len(others) else True
+        return _Layout(np.array([sensor if sensor < GYROS else -1 for sensor in sensors]),
+                       rows, spared)
 
+    def _add_gyro(self, gyro: int) -> None:
+        self._gyros += (gyro,)
+        self._layouts.clear()
+        self.x = np.append(self.x, 0.0)
+        self.P = np.pad(self.P, (0, 1))
+        self.P[-1, -1] = INITIAL_BIAS_SIGMA ** 2
+        self._suspicions = np.pad(self._suspicions, ((0, 0), (0, 1)))
+        self._resize()
 
-@kernel
-def _process_noise(angles: Array, gamma: Array, duration: float,
-                   disturbance: float, constants: Constants, noise: Array) -> None:
-    a00, a01, a11 = _reduced_mass(angles, gamma, constants)
-    # Covariance density of G tau for independent link torques, then of the accelerations.
-    density = disturbance * disturbance
-    f00 = density * (1.0 + gamma[0, 0] ** 2 + gamma[1, 0] ** 2)
-    f01 = density * (gamma[0, 0] * gamma[0, 1] + gamma[1, 0] * gamma[1, 1])
-    f11 = density * (1.0 + gamma[0, 1] ** 2 + gamma[1, 1] ** 2)
-    scale = 1.0 / (a00 * a11 - a01 * a01)
-    i00, i01, i11 = a11 * scale, -a01 * scale, a00 * scale
-    l00, l01 = i00 * f00 + i01 * f01, i00 * f01 + i01 * f11
-    l10, l11 = i01 * f00 + i11 * f01, i01 * f01 + i11 * f11
-    q00 = l00 * i00 + l01 * i01
-    q01 = l00 * i01 + l01 * i11
-    q11 = l10 * i01 + l11 * i11
-    for row in range(4):
-        for column in range(4):
-            axis_row, axis_column = row % 2, column % 2
-            value = q01 if axis_row != axis_column else (q11 if axis_row else q00)
-            order = (row < 2) + (column < 2)
-            if order == 2:
-                value *= duration ** 3 / 3.0
-            elif order == 1:
-                value *= duration ** 2 / 2.0
-            else:
-                value *= duration
-            noise[row, column] = value
-
-
-@kernel
-def _reduced_mass(angles: Array, gamma: Array, constants: Constants
-                  ) -> tuple[float, float, float]:
-    """Evaluate A = W^T M W with the given Gamma."""
-    matrix = mass_matrix(angles, constants)
-    a = np.zeros((2, 2))
-    for i in range(2):
-        for j in range(2):
-            a[i, j] = matrix[i, j]
-            for k in range(2):
-                a[i, j] += (matrix[i, 2 + k] * gamma[k, j] + matrix[j, 2 + k] * gamma[k, i])
-                for m in range(2):
-                    a[i, j] += gamma[k, i] * matrix[2 + k, 2 + m] * gamma[m, j]
-    return a[0, 0], a[0, 1], a[1, 1]
+    def _resize(self) -> None:
+        """Make room for F and Q of the present state."""
+        self.dim_x = len(self.x)
+        self.F, self.Q = np.zeros_like(self.P), np.zeros_like(self.P)

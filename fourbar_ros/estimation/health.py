@@ -22,8 +22,6 @@ finds it while the linkage rests: that it is the same bit for bit does.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from fourbar_ros.mechanism import SENSOR_NAMES
 
 # A sensor without a sample for so long gives no data [ns].
@@ -84,10 +82,9 @@ class SensorHealth:
             self._least_gap_ns[sensor] = least_ns = gap_ns
         self._gap[sensor] += (min(gap_ns / least_ns, LONGEST_GAP) - self._gap[sensor]) / GAPS_OVER
 
-    def judged(self, sensors: Sequence[int], used: Sequence[bool]) -> None:
-        """Take note of what the gate made of some samples."""
-        for sensor, taken in zip(sensors, used):
-            self._refused[sensor] += ((not taken) - self._refused[sensor]) / REFUSED_OVER
+    def judged(self, sensor: int, refused: bool) -> None:
+        """Take note of what the gate made of a sample."""
+        self._refused[sensor] += (refused - self._refused[sensor]) / REFUSED_OVER
 
     def stuck(self, sensor: int) -> bool:
         """

@@ -71,10 +71,11 @@ class ClosedLoop:
         for sample in samples.links:
             with suppress(RejectedError):
                 self.estimator.measure(
-                    sample.stamp_ns, sample.names, sample.angles.tolist())
+                    sample.stamp_ns, sample.names, sample.angles.tolist(), sample.rates.tolist())
         estimate = None
         with suppress(RejectedError):
-            estimate = self.estimator.tick(stamp_ns, samples.wheels.speeds)
+            estimate = self.estimator.tick(
+                stamp_ns, samples.wheels.speeds, samples.wheels.efforts)
         if estimate is None:
             return Step(samples, None, None)
         control = self.controller.tick(

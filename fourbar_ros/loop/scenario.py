@@ -156,7 +156,9 @@ ALLOWED: dict[str, dict[str, Allowed]] = {
         'timeout_action': TIMEOUT_ACTIONS},
     'estimator': {
         'angle_noise': (1e-9, 1.0, 'rad'), 'counts_per_turn': (0, 2 ** 31, ''),
-        'disturbance_torque': (0.0, 10.0, 'N m/sqrt(Hz)'), 'gate_probability': (0.9, 1.0, '')},
+        'gyro_noise': (1e-9, 100.0, 'rad/s'), 'gyro_walk': (0.0, 10.0, 'rad/s/sqrt(s)'),
+        'disturbance_torque': (0.0, 10.0, 'N m/sqrt(Hz)'),
+        'disturbance_walk': (0.0, 10.0, 'N m/sqrt(s)'), 'gate_probability': (0.9, 1.0, '')},
     'controller': {
         'bandwidth': (0.1, 20.0, 'rad/s'), 'damping': (0.1, 2.0, ''),
         'setpoint_duration': (0.1, 3600.0, 's')},

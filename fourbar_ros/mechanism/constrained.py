@@ -69,7 +69,7 @@ def directions(angles: Four) -> tuple[Four, Four]:
 @kernel
 def constrained_accelerations(
     angle_a: float, cosines: Four, sines: Four, rates: Four, velocity: tuple[float, float],
-    torques: Array, constants: Constants, around: Surroundings,
+    torques: Array, constants: Constants, around: Surroundings, weak_held: bool,
 ) -> tuple[Four, tuple[float, float], float]:
     """
     Solve the constrained form.
@@ -79,10 +79,12 @@ def constrained_accelerations(
     :param rates: of the links [rad/s].
     :param velocity: of the mass centre [m/s].
     :param torques: (4,) of the motors on the wheels [N m]; each link feels the opposite.
+    :param weak_held: False where the weak direction is as free as it is at a change point; for
+        who does not know the angles well enough to tell which way the linkage is off it.
     :returns: accelerations of the links [rad/s^2] and of the mass centre [m/s^2], and the sum of
         the torques on the links [N m].
     """
-    factor, bias = _inertia(cosines, sines, rates, constants)
+    factor, bias = factored_inertia(cosines, sines, rates, constants)
     forces = (-torques[0], -torques[1], -torques[2], -torques[3])
     push = (0.0, 0.0)
     if around.acting:
@@ -92,24 +94,24 @@ def constrained_accelerations(
             constants, around)
         forces = combine(1.0, forces, 1.0, effects)
     total = forces[0] + forces[1] + forces[2] + forces[3]
-    free = _solve_upper(factor, _solve_lower(factor, combine(1.0, forces, -1.0, bias)))
+    free = solve_upper(factor, solve_lower(factor, combine(1.0, forces, -1.0, bias)))
     # A turn of the whole changes no derivative of the closure.
     mean = 0.25 * (rates[0] + rates[1] + rates[2] + rates[3])
     w = (rates[0] - mean, rates[1] - mean, rates[2] - mean, rates[3] - mean)
     # s_i l_i e_i: J alpha is the sum of it times rate^2; J is it, turned by a quarter.
-    x, y = _signed_links(cosines, sines, constants.lengths)
+    x, y = signed_links(cosines, sines, constants.lengths)
     square = multiply(w, w)
     need_x, need_y = dot(x, square) + dot(y, free), dot(y, square) - dot(x, free)
-    strong, weak, c, s = _orthogonal_columns(factor, x, y)
+    strong, weak, c, s = orthogonal_columns(factor, x, y)
     size, remains = dot(strong, strong), dot(weak, weak)
     need_strong, need_weak = c * need_x + s * need_y, c * need_y - s * need_x
-    if remains < AT_CHANGE_POINT * AT_CHANGE_POINT * size:
+    if weak_held and remains < AT_CHANGE_POINT * AT_CHANGE_POINT * size:
         # Third derivative: J d(alpha)/dt - 3 sum s l e rate alpha - sum s l E e rate^3 = 0.
         cube = multiply(w, square)
         pull_x, pull_y = multiply(x, w), multiply(y, w)
         third_x, third_y = 3.0 * dot(pull_x, free) - dot(y, cube), 3.0 * dot(
             pull_y, free) + dot(x, cube)
-        third = _solve_lower(factor, combine(-3.0 * c, pull_y, 3.0 * s, pull_x))
+        third = solve_lower(factor, combine(-3.0 * c, pull_y, 3.0 * s, pull_x))
         along = dot(third, strong) / size
         third = combine(1.0, third, -along, strong)
         need_third = c * third_y - s * third_x - along * need_strong
@@ -122,40 +124,43 @@ def constrained_accelerations(
             weak = combine(1.0, weak, time, third)
             need_weak += time * need_third
             remains = dot(weak, weak)
-    share = need_weak / remains if remains > LOST * LOST * size else 0.0
+    share = need_weak / remains if weak_held and remains > LOST * LOST * size else 0.0
     correction = combine(need_strong / size, strong, share, weak)
-    accelerations = combine(1.0, free, 1.0, _solve_upper(factor, correction))
+    accelerations = combine(1.0, free, 1.0, solve_upper(factor, correction))
     mass = constants.total_mass
     return accelerations, (push[0] / mass, push[1] / mass), total
 
 
 @kernel
 def advance_constrained(state: Array, start: Array, middle: Array, end: Array, step: float,
-                        constants: Constants, around: Surroundings) -> None:
+                        constants: Constants, around: Surroundings, weak_held: bool
+                        ) -> None:
     """
     Advance links and mass centre by one Runge-Kutta step of order four, in place.
 
     Where lengths that almost match let the links turn over faster than the step can follow, it is
-    divided. Parameters as of `advance_reduced`.
+    divided. Parameters as of `advance_reduced` and `constrained_accelerations`.
     """
-    if _advance_once(state, start, middle, end, step, False, constants, around):
+    if _advance_once(state, start, middle, end, step, False, constants, around, weak_held):
         return
     parts, before = 2, state.copy()
-    while not _advance_in_parts(state, start, middle, end, step, parts, constants, around):
+    while not _advance_in_parts(state, start, middle, end, step, parts, constants, around,
+                                weak_held):
         state[:] = before
         parts *= 2
 
 
 @kernel
 def _advance_in_parts(state: Array, start: Array, middle: Array, end: Array, step: float,
-                      parts: int, constants: Constants, around: Surroundings) -> bool:
+                      parts: int, constants: Constants, around: Surroundings, weak_held: bool
+                      ) -> bool:
     """Tell whether that many parts were enough."""
     torques = np.empty((3, 4))
     for part in range(parts):
         for stage in range(3):
             interpolate(start, middle, end, (part + 0.5 * stage) / parts, torques[stage])
         if not _advance_once(state, torques[0], torques[1], torques[2], step / parts,
-                             parts >= MOST_PARTS, constants, around):
+                             parts >= MOST_PARTS, constants, around, weak_held):
             return False
     return True
 
@@ -170,7 +175,8 @@ def interpolate(start: Array, middle: Array, end: Array, part: float, out: Array
 
 @kernel
 def _advance_once(state: Array, start: Array, middle: Array, end: Array, step: float,
-                  at_any_length: bool, constants: Constants, around: Surroundings) -> bool:
+                  at_any_length: bool, constants: Constants, around: Surroundings,
+                  weak_held: bool) -> bool:
     """
     Take one step, then meet the closure again, and angular momentum as in `advance_reduced`.
 
@@ -183,28 +189,31 @@ def _advance_once(state: Array, start: Array, middle: Array, end: Array, step: f
     half, sixth = 0.5 * step, step / 6.0
     cosines, sines = directions(angles)
     alpha1, pull1, sum1 = constrained_accelerations(
-        a0, cosines, sines, rates, velocity, start, constants, around)
+        a0, cosines, sines, rates, velocity, start, constants, around, weak_held)
     rates2 = combine(1.0, rates, half, alpha1)
     cosines2, sines2 = _turned(cosines, sines, rates, half)
     alpha2, pull2, sum2 = constrained_accelerations(
         a0 + half * rates[0], cosines2, sines2, rates2,
-        (velocity[0] + half * pull1[0], velocity[1] + half * pull1[1]), middle, constants, around)
+        (velocity[0] + half * pull1[0], velocity[1] + half * pull1[1]), middle, constants, around,
+        weak_held)
     rates3 = combine(1.0, rates, half, alpha2)
     cosines3, sines3 = _turned(cosines, sines, rates2, half)
     alpha3, pull3, sum3 = constrained_accelerations(
         a0 + half * rates2[0], cosines3, sines3, rates3,
-        (velocity[0] + half * pull2[0], velocity[1] + half * pull2[1]), middle, constants, around)
+        (velocity[0] + half * pull2[0], velocity[1] + half * pull2[1]), middle, constants, around,
+        weak_held)
     rates4 = combine(1.0, rates, step, alpha3)
     cosines4, sines4 = _turned(cosines, sines, rates3, step)
     alpha4, pull4, sum4 = constrained_accelerations(
         a0 + step * rates3[0], cosines4, sines4, rates4,
-        (velocity[0] + step * pull3[0], velocity[1] + step * pull3[1]), end, constants, around)
+        (velocity[0] + step * pull3[0], velocity[1] + step * pull3[1]), end, constants, around,
+        weak_held)
 
     mean_rates = _weighted_mean(rates, rates2, rates3, rates4)
     before, _ = _spin(cosines, sines, rates, constants)
     angles = combine(1.0, angles, step, mean_rates)
     rates = combine(1.0, rates, step, _weighted_mean(alpha1, alpha2, alpha3, alpha4))
-    angles, rates = project_onto_closure(angles, rates, constants)
+    angles, rates = project_onto_closure(angles, rates, constants, weak_held)
     change = combine(1.0, alpha3, -1.0, alpha2)
     followed = step * sqrt(dot(change, change)) <= RESOLUTION * sqrt(dot(rates, rates))
     if not (followed or at_any_length):
@@ -225,7 +234,8 @@ def _advance_once(state: Array, start: Array, middle: Array, end: Array, step: f
 
 
 @kernel
-def project_onto_closure(angles: Four, rates: Four, constants: Constants) -> tuple[Four, Four]:
+def project_onto_closure(angles: Four, rates: Four, constants: Constants, weak_held: bool
+                         ) -> tuple[Four, Four]:
     """
     Remove the closure error from angles and rates.
 
@@ -234,14 +244,15 @@ def project_onto_closure(angles: Four, rates: Four, constants: Constants) -> tup
 
     :param angles: of the links, close to the closure [rad].
     :param rates: of the links [rad/s].
+    :param weak_held: as of :func:`constrained_accelerations`.
     :returns: both.
     """
     cosines, sines = directions(angles)
-    factor, _ = _inertia(cosines, sines, rates, constants)
-    x, y = _signed_links(cosines, sines, constants.lengths)
-    strong, weak, c, s = _orthogonal_columns(factor, x, y)
+    factor, _ = factored_inertia(cosines, sines, rates, constants)
+    x, y = signed_links(cosines, sines, constants.lengths)
+    strong, weak, c, s = orthogonal_columns(factor, x, y)
     size, remains = dot(strong, strong), dot(weak, weak)
-    held = remains > AT_CHANGE_POINT * AT_CHANGE_POINT * size
+    held = weak_held and remains > AT_CHANGE_POINT * AT_CHANGE_POINT * size
     # J = (-y; x): the gap is (sum x, sum y) and opens at (-y . rates, x . rates).
     gap_x, gap_y = x[0] + x[1] + x[2] + x[3], y[0] + y[1] + y[2] + y[3]
     slip_x, slip_y = -dot(y, rates), dot(x, rates)
@@ -249,8 +260,8 @@ def project_onto_closure(angles: Four, rates: Four, constants: Constants) -> tup
                       -(c * gap_y - s * gap_x) / remains if held else 0.0, weak)
     stopping = combine(-(c * slip_x + s * slip_y) / size, strong,
                        -(c * slip_y - s * slip_x) / remains if held else 0.0, weak)
-    return (combine(1.0, angles, 1.0, _solve_upper(factor, closing)),
-            combine(1.0, rates, 1.0, _solve_upper(factor, stopping)))
+    return (combine(1.0, angles, 1.0, solve_upper(factor, closing)),
+            combine(1.0, rates, 1.0, solve_upper(factor, stopping)))
 
 
 @kernel
@@ -261,9 +272,9 @@ def rates_of_impulse(angles: Four, impulse: Four, constants: Constants) -> Four:
     :param impulse: generalized, on the link angles [N m s].
     """
     cosines, sines = directions(angles)
-    factor, _ = _inertia(cosines, sines, impulse, constants)
-    free = _solve_upper(factor, _solve_lower(factor, impulse))
-    return project_onto_closure(angles, free, constants)[1]
+    factor, _ = factored_inertia(cosines, sines, impulse, constants)
+    free = solve_upper(factor, solve_lower(factor, impulse))
+    return project_onto_closure(angles, free, constants, True)[1]
 
 
 @kernel
@@ -308,14 +319,14 @@ def _spin(cosines: Four, sines: Four, rates: Four, constants: Constants) -> tupl
 
 
 @kernel
-def _signed_links(cosines: Four, sines: Four, lengths: Array) -> tuple[Four, Four]:
+def signed_links(cosines: Four, sines: Four, lengths: Array) -> tuple[Four, Four]:
     """Return x and y of the links [m], with their signs in the closure."""
     signed = (-lengths[0], lengths[1], lengths[2], -lengths[3])
     return multiply(signed, cosines), multiply(signed, sines)
 
 
 @kernel
-def _inertia(cosines: Four, sines: Four, rates: Four, constants: Constants
+def factored_inertia(cosines: Four, sines: Four, rates: Four, constants: Constants
              ) -> tuple[Triangle, Four]:
     """Factor M into L L^T, and evaluate the bias h."""
     l_c, l_d = constants.lengths[2], constants.lengths[3]
@@ -339,7 +350,7 @@ def _inertia(cosines: Four, sines: Four, rates: Four, constants: Constants
 
 
 @kernel
-def _solve_lower(factor: Triangle, v: Four) -> Four:
+def solve_lower(factor: Triangle, v: Four) -> Four:
     """Solve L x = v."""
     aa, ba, bb, ca, cb, cc, da, db, dc, dd = factor
     a = v[0] * aa
@@ -349,7 +360,7 @@ def _solve_lower(factor: Triangle, v: Four) -> Four:
 
 
 @kernel
-def _solve_upper(factor: Triangle, v: Four) -> Four:
+def solve_upper(factor: Triangle, v: Four) -> Four:
     """Solve L^T x = v."""
     aa, ba, bb, ca, cb, cc, da, db, dc, dd = factor
     d = v[3] * dd
@@ -359,7 +370,7 @@ def _solve_upper(factor: Triangle, v: Four) -> Four:
 
 
 @kernel
-def _orthogonal_columns(factor: Triangle, x: Four, y: Four) -> tuple[Four, Four, float, float]:
+def orthogonal_columns(factor: Triangle, x: Four, y: Four) -> tuple[Four, Four, float, float]:
     """
     Turn the columns of `L^-1 J^T` into orthogonal ones, the larger one first.
 
@@ -368,8 +379,8 @@ def _orthogonal_columns(factor: Triangle, x: Four, y: Four) -> tuple[Four, Four,
     :param x, y: the links with their signs [m]; J = (-y; x).
     :returns: the columns, and cosine and sine of the rotation.
     """
-    first = _solve_lower(factor, (-y[0], -y[1], -y[2], -y[3]))
-    second = _solve_lower(factor, x)
+    first = solve_lower(factor, (-y[0], -y[1], -y[2], -y[3]))
+    second = solve_lower(factor, x)
     p, q, r = dot(first, first), dot(first, second), dot(second, second)
     half = 0.5 * (p - r)
     size = hypot(half, q)

@@ -70,7 +70,7 @@ def advance_state(state: Array, start: Array, middle: Array, end: Array, step: f
     if constants.compliant:
         advance_compliant(state, start, middle, end, step, constants, around)
     elif not advance_reduced(state, start, middle, end, step, constants, around):
-        advance_constrained(state, start, middle, end, step, constants, around)
+        advance_constrained(state, start, middle, end, step, constants, around, True)
     turned = (state[0] - a, state[1] - b, state[2] - c, state[3] - d)
     rates = (rate_a, rate_b, rate_c, rate_d)
     for j in range(4):
@@ -94,7 +94,7 @@ def meet_closure(state: Array, constants: Constants) -> None:
     if not close_reduced(state, constants):
         angles, rates = project_onto_closure(
             (state[0], state[1], state[2], state[3]), (state[4], state[5], state[6], state[7]),
-            constants)
+            constants, True)
         for j in range(4):
             state[j], state[4 + j] = angles[j], rates[j]
 
@@ -117,7 +117,7 @@ def evaluate(state: Array, torques: Array, constants: Constants, around: Surroun
         cosines, sines = directions((state[0], state[1], state[2], state[3]))
         (a, b, c, d), (ax, ay), _ = constrained_accelerations(
             state[0], cosines, sines, (state[4], state[5], state[6], state[7]), (vx, vy),
-            torques, constants, around)
+            torques, constants, around, True)
     out[4], out[5], out[6], out[7] = a, b, c, d
     for j in range(4):
         out[j] = state[4 + j]

@@ -48,8 +48,15 @@ PARAMETERS = (
               'standard deviation of a link-angle sample', limits=(1e-9, 1.0)),
     Parameter('counts_per_turn', DEFAULTS.counts_per_turn, '',
               'resolution of the link-angle sensors, 0 for none', limits=(0, 2 ** 31)),
+    Parameter('gyro_noise', DEFAULTS.gyro_noise, 'rad/s',
+              'standard deviation of a gyro sample, where gyros are fitted', limits=(1e-9, 100.0)),
+    Parameter('gyro_walk', DEFAULTS.gyro_walk, 'rad/s/sqrt(s)',
+              'density of the random walk of the bias of a gyro', limits=(0.0, 10.0)),
     Parameter('disturbance_torque', DEFAULTS.disturbance_torque, 'N m/sqrt(Hz)',
               'density of unknown torques on each link', limits=(0.0, 10.0)),
+    Parameter('disturbance_walk', DEFAULTS.disturbance_walk, 'N m/sqrt(s)',
+              'density of the random walk of the torques that stand for friction and drag',
+              limits=(0.0, 10.0)),
     Parameter('gate_probability', DEFAULTS.gate_probability, '',
               'share of the samples of a healthy sensor that is used, 1 for no gate',
               limits=(0.9, 1.0)),
@@ -87,7 +94,8 @@ class EstimatorNode(Node):
 
     def _on_angles(self, message):
         try:
-            self._estimator.measure(stamp_of(message), message.name, message.position)
+            self._estimator.measure(
+                stamp_of(message), message.name, message.position, message.velocity)
         except RejectedError as error:
             self._log.warn(f'link_angles rejected: {error}')
 
@@ -98,8 +106,9 @@ class EstimatorNode(Node):
             self._answer(*self._answered)
             return
         try:
-            estimate = self._estimator.tick(
-                stamp_ns, message.velocity if tuple(message.name) == FLYWHEEL_NAMES else ())
+            if tuple(message.name) != FLYWHEEL_NAMES:
+                raise RejectedError('wheels', f'the names must be {", ".join(FLYWHEEL_NAMES)}')
+            estimate = self._estimator.tick(stamp_ns, message.velocity, message.effort)
         except RejectedError as error:
             self._log.warn(f'flywheel_states rejected: {error}')
             self._answer(stamp_ns, None)
@@ -131,7 +140,7 @@ class EstimatorNode(Node):
         names = ('nis', 'degrees_of_freedom',
                  *(SENSOR_NAMES[sensor] for sensor in innovation.sensors))
         self._innovation.publish(
-            stamp_ns, [innovation.nis, innovation.degrees_of_freedom, *innovation.angles],
+            stamp_ns, [innovation.nis, innovation.degrees_of_freedom, *innovation.values],
             names=names)
 
     def _collect(self):

@@ -17,7 +17,8 @@
 from dataclasses import dataclass, replace
 
 from filterpy.kalman import ExtendedKalmanFilter
-from fourbar_ros.estimation.filter import LinkageFilter
+from fourbar_ros.estimation.filter import GYROS, LinkageFilter, Randomness
+from fourbar_ros.estimation.layout import FREE
 from fourbar_ros.mechanism import assemble, Mechanism, nearest_assembly, reduced_form
 from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.mechanism.forces import NOTHING
@@ -41,6 +42,7 @@ DISTURBANCE = 1e-6
 START_RATE = 0.05
 RUNS, TICKS = 40, 150
 BOUNDS = 0.95
+QUIET = Randomness(1e-7)
 
 
 # The model
@@ -66,6 +68,12 @@ def independent_end(mechanism: Mechanism, start: Array, guess: Array, torques: A
     return end
 
 
+def set_rates(linkage: LinkageFilter, mechanism: Mechanism, rates: Array) -> None:
+    """Let links a and b have these rates, and the others what the closure makes of them."""
+    gamma = reduced_form(mechanism, linkage.angles, rates).gamma
+    linkage.x[4:8] = np.concatenate([rates, gamma @ rates])
+
+
 @pytest.mark.parametrize('branch', ['open', 'crossed'])
 @pytest.mark.parametrize('duration', [1e-3, 2e-2])
 def test_prediction_and_transition_are_those_of_the_linkage(
@@ -74,14 +82,14 @@ def test_prediction_and_transition_are_those_of_the_linkage(
     angles = assemble(mechanism, 0.4, 1.7, branch)
     torques = np.array([3e-5, -2e-5, 1e-5, 4e-5])
     start = np.array([0.4, 1.7, 2.0, -1.5])
-    linkage = LinkageFilter(mechanism, angles, 1e-6, 1e-4, 0.0)
-    linkage.x = start.copy()
+    linkage = LinkageFilter(mechanism, angles, 1e-6, 1e-4, Randomness(0.0))
+    set_rates(linkage, mechanism, start[2:])
     linkage.move(duration, torques)
     # One step of order four. Its scale is twice the relative rate of 3.5 rad/s (products of two
     # sines) over the sine of the fold; for the short step it is the integrator's tolerance.
     model = (7.0 / abs(np.sin(angles[3] - angles[2])) * duration) ** 5 / 120.0
     end = independent_end(mechanism, start, angles, torques, duration)
-    np.testing.assert_allclose(linkage.x, end, rtol=0.0, atol=max(model, 1e-11))
+    np.testing.assert_allclose(linkage.x[FREE], end, rtol=0.0, atol=max(model, 1e-11))
     # Central differences of both sides: 1e-12 of the integrator over 2e-4 here, 2e-16 over 2e-6
     # there, and a third derivative times 1e-8 / 6.
     width = 1e-4
@@ -90,7 +98,7 @@ def test_prediction_and_transition_are_those_of_the_linkage(
         ends = [independent_end(mechanism, start + sign * width * np.eye(4)[column], angles,
                                 torques, duration) for sign in (1.0, -1.0)]
         transition[:, column] = (ends[0] - ends[1]) / (2.0 * width)
-    np.testing.assert_allclose(linkage.F, transition, rtol=0.0, atol=5e-8 + 10.0 * model)
+    np.testing.assert_allclose(linkage.F[FREE[:, None], FREE], transition, rtol=0.0, atol=5e-8 + 10.0 * model)
 
 
 def test_wheel_motion_predicts_the_plant(mechanism: Mechanism) -> None:
@@ -98,8 +106,8 @@ def test_wheel_motion_predicts_the_plant(mechanism: Mechanism) -> None:
     plant = Plant(mechanism, Table(LinkSensorSettings(), WheelEncoders(0)),
                   InitialState(0.3, 1.6, 'open', 1.0, -0.5), 5e-4, np.random.default_rng(0))
     truth = plant.truth()
-    linkage = LinkageFilter(mechanism, truth.link_angles, 1e-6, 1e-4, 0.0)
-    linkage.x = np.concatenate([truth.link_angles[:2], truth.link_rates[:2]])
+    linkage = LinkageFilter(mechanism, truth.link_angles, 1e-6, 1e-4, Randomness(0.0))
+    set_rates(linkage, mechanism, truth.link_rates[:2])
     rng = np.random.default_rng(5)
     for _ in range(50):
         before = plant.truth().wheel_speeds
@@ -142,8 +150,8 @@ def monte_carlo(mechanism: Mechanism, seed: int) -> Consistency:
     constants = mechanism.constants_with(np.ones(4, dtype=bool))
     for run in range(RUNS):
         angles = assemble(mechanism, 0.2, 1.5)
-        linkage = LinkageFilter(mechanism, angles, NOISE ** 2, START_RATE ** 2, DISTURBANCE)
-        start = linkage.x + rng.standard_normal(4) * np.sqrt(np.diag(linkage.P))
+        linkage = LinkageFilter(mechanism, angles, NOISE ** 2, START_RATE ** 2, Randomness(DISTURBANCE))
+        start = linkage.x[FREE] + rng.standard_normal(4) * linkage.sigmas()[FREE]
         state = np.zeros(STATE_SIZE)
         state[:4] = nearest_assembly(mechanism, (0, 1), (start[0], start[1]), angles)
         gamma = reduced_form(mechanism, state[:4], start[2:]).gamma
@@ -155,15 +163,16 @@ def monte_carlo(mechanism: Mechanism, seed: int) -> Consistency:
                 disturbed = wheels + DISTURBANCE / np.sqrt(PERIOD / 2) * rng.standard_normal(4)
                 move_held(state, disturbed, PERIOD / 2, 1, constants, NOTHING)
             linkage.move(PERIOD, wheels)
-            innovation, nis[run, tick], _ = linkage.correct(
+            seen = linkage.correct(
                 ALL, state[:4] + NOISE * rng.standard_normal(4), NOISE ** 2)
+            innovation, nis[run, tick] = seen.innovation, seen.nis
             whitened[run, tick] = np.linalg.solve(np.linalg.cholesky(linkage.S), innovation)
-            error = linkage.x - state[[0, 1, 4, 5]]
+            error = linkage.x[FREE] - state[[0, 1, 4, 5]]
             errors[run, tick] = error
-            nees[run, tick] = error @ np.linalg.solve(linkage.P, error)
+            nees[run, tick] = error @ np.linalg.solve(linkage.free_covariance, error)
             link_errors[run, tick] = np.concatenate(
                 [linkage.angles - state[:4], linkage.rates - state[4:8]])
-            sigmas[run, tick] = np.concatenate(linkage.sigmas())
+            sigmas[run, tick] = linkage.sigmas()[:8]
     return Consistency(errors, nees, nis, whitened, link_errors, sigmas)
 
 
@@ -227,25 +236,33 @@ def test_measuring_makes_the_filter_surer(consistency: Consistency) -> None:
 # Single corrections
 
 def test_sigma_of_a_parallel_link_is_that_of_its_partner(paper: Mechanism) -> None:
-    linkage = LinkageFilter(paper, assemble(paper, 0.2, 1.5), 4e-6, 1e-2, 1e-7)
-    linkage.P[1, 1], linkage.P[3, 3] = 9e-6, 4e-2
-    angles, rates = linkage.sigmas()
-    np.testing.assert_allclose(angles, [2e-3, 3e-3, 2e-3, 3e-3], rtol=1e-12)
-    np.testing.assert_allclose(rates, [0.1, 0.2, 0.1, 0.2], rtol=1e-12)
+    linkage = LinkageFilter(paper, assemble(paper, 0.2, 1.5), 4e-6, 1e-2, QUIET)
+    linkage.correct((1,), linkage.angles[1:2], 1e-6)
+    linkage.move(PERIOD, np.zeros(4))
+    sigmas = linkage.sigmas()[:8].reshape(2, 4)
+    np.testing.assert_allclose(sigmas[:, 2:], sigmas[:, :2], rtol=1e-8)
+    assert sigmas[0, 1] < 0.6 * sigmas[0, 0]
 
 
-def test_sigma_follows_gamma(uneven: Mechanism) -> None:
+def test_sigma_follows_the_closure(uneven: Mechanism) -> None:
     """Error propagation through the closure, by finite differences of the assembly."""
     angles = assemble(uneven, 0.2, 1.5)
-    linkage = LinkageFilter(uneven, angles, 4e-6, 1e-2, 1e-7)
-    linkage.P[0, 1] = linkage.P[1, 0] = 1e-6
-    slopes = np.array([
-        (nearest_assembly(uneven, (0, 1), (0.2 + da, 1.5 + db), angles)
-         - nearest_assembly(uneven, (0, 1), (0.2 - da, 1.5 - db), angles)) / 2e-5
-        for da, db in ((1e-5, 0.0), (0.0, 1e-5))])
-    variances = np.einsum('ji,jk,ki->i', slopes, linkage.P[:2, :2], slopes)
-    # Differences of 1e-5: 1e-16 / 1e-5 of rounding, 1e-10 of curvature.
-    np.testing.assert_allclose(linkage.sigmas()[0], np.sqrt(variances), rtol=1e-8)
+    linkage = LinkageFilter(uneven, angles, 4e-6, 1e-2, QUIET)
+    set_rates(linkage, uneven, np.array([1.0, -2.0]))
+    linkage.correct((1, 2), angles[1:3], 1e-6)
+    linkage.move(PERIOD, np.zeros(4))
+
+    def follow(x: Array) -> Array:
+        found = nearest_assembly(uneven, (0, 1), (x[0], x[1]), linkage.angles)
+        gamma = reduced_form(uneven, found, x[2:]).gamma
+        return np.concatenate([found, x[2:], gamma @ x[2:]])
+    free = linkage.x[FREE]
+    slopes = np.array([(follow(free + step) - follow(free - step)) / 2e-5
+                       for step in 1e-5 * np.eye(4)]).T
+    expected = slopes @ linkage.free_covariance @ slopes.T
+    # Differences of 1e-5: 1e-16 / 1e-5 of rounding, 1e-10 of curvature; and what the noise of one
+    # step leaves at the angles that the rates of c and d have from how Gamma changes.
+    np.testing.assert_allclose(linkage.sigmas()[:8], np.sqrt(expected.diagonal()), rtol=1e-7)
 
 
 @pytest.mark.parametrize('turns', [-3, -1, 1, 50])
@@ -254,7 +271,7 @@ def test_turn_of_a_measurement_does_not_matter(turns: int, mechanism: Mechanism)
     measured = angles + [1e-3, -1e-3, 2e-3, 0.0]
     ends = []
     for offset in (0.0, 2.0 * np.pi * turns):
-        linkage = LinkageFilter(mechanism, angles, 1e-6, 1e-4, 1e-7)
+        linkage = LinkageFilter(mechanism, angles, 1e-6, 1e-4, QUIET)
         linkage.correct(ALL, measured + offset, 1e-6)
         ends.append(linkage.angles)
     # 50 turns have a rounding of 6e-14.
@@ -265,7 +282,7 @@ def test_measured_link_tells_its_partner(paper: Mechanism) -> None:
     """A link that never gives a sample is known through the closure."""
     angles = assemble(paper, 0.2, 1.5)
     target = assemble(paper, 0.25, 1.45)
-    linkage = LinkageFilter(paper, angles, 1e-2, 1e-4, 1e-7)
+    linkage = LinkageFilter(paper, angles, 1e-2, 1e-4, QUIET)
     for _ in range(100):
         linkage.correct((2, 3), target[2:], 1e-6)
     # What the prior of 0.1 rad still weighs after a hundred samples of 1 mrad: 1e-6 of 0.05 rad.
@@ -280,61 +297,83 @@ def test_gate_leaves_out_what_is_far_off_and_nothing_else(
     angles = assemble(uneven, 0.2, 1.5)
     measured = angles + [1e-3, -1e-3, 2e-3, 0.0]
     right = tuple(link for link in ALL if link not in wrong)
-    gated, alone = (LinkageFilter(uneven, angles, 1e-6, 1e-4, 1e-7) for _ in range(2))
-    nis = alone.correct(right, measured[list(right)], 1e-6)[1]
+    gated, alone = (LinkageFilter(uneven, angles, 1e-6, 1e-4, QUIET) for _ in range(2))
+    nis = alone.correct(right, measured[list(right)], 1e-6).nis
     measured[list(wrong)] += 0.1
-    innovation, found, used = gated.correct(ALL, measured, 1e-6, gate=15.0)
-    assert used.tolist() == [link in right for link in ALL]
-    assert found == pytest.approx(nis, rel=1e-12)
-    np.testing.assert_allclose(innovation, measured - angles, rtol=1e-12)
+    seen = gated.correct(ALL, measured, 1e-6, gate=15.0)
+    assert seen.used.tolist() == [link in right for link in ALL]
+    assert seen.nis == pytest.approx(nis, rel=1e-12)
+    np.testing.assert_allclose(seen.innovation, measured - angles, rtol=1e-12)
     np.testing.assert_allclose(gated.x, alone.x, rtol=1e-14)
     np.testing.assert_allclose(gated.P, alone.P, rtol=1e-12, atol=1e-20)
 
 
 def test_nothing_within_the_gate_changes_nothing(paper: Mechanism) -> None:
     angles = assemble(paper, 0.2, 1.5)
-    linkage = LinkageFilter(paper, angles, 1e-6, 1e-4, 1e-7)
-    before = [array.copy() for array in linkage.snapshot()]
-    _, nis, used = linkage.correct(ALL, angles + 0.5, 1e-6, gate=15.0)
-    assert nis == 0.0 and not used.any()
+    linkage = LinkageFilter(paper, angles, 1e-6, 1e-4, QUIET)
+    before = linkage.snapshot()[:3]
+    seen = linkage.correct(ALL, angles + 0.5, 1e-6, gate=15.0)
+    assert seen.nis == 0.0 and not seen.used.any()
     for then, now in zip(before, linkage.snapshot()):
         assert then.tobytes() == now.tobytes()
 
 
-@pytest.mark.parametrize(
-    'sensors', [(0, 1, 2, 3), (0, 2), (3,), (1, 4, 5, 6, 7), (4, 6)], ids=str)
+def textbook_of(linkage: LinkageFilter, measurements: int) -> ExtendedKalmanFilter:
+    """Return filterpy's filter in the same state."""
+    textbook = ExtendedKalmanFilter(dim_x=len(linkage.x), dim_z=measurements)
+    textbook.x, textbook.P = linkage.x.copy(), linkage.P.copy()
+    return textbook
+
+
+# Some angles; some angles with their gyros.
+SEEN = [(0, 1, 2, 3), (0, 2), (3,), (1, 4, 5, 6, 7), (4, 6), (0, 1, GYROS, GYROS + 1),
+        (2, 5, GYROS + 2, GYROS + 5)]
+
+
+@pytest.mark.parametrize('sensors', SEEN, ids=str)
 @pytest.mark.parametrize('seed', range(5))
 def test_compiled_steps_are_those_of_filterpy(
     sensors: tuple[int, ...], seed: int, mechanism: Mechanism,
 ) -> None:
     """Predict and correct once, and let filterpy do the same with the same matrices."""
     rng = np.random.default_rng(seed)
-    angles = assemble(mechanism, 3.0, 4.3)
-    linkage = LinkageFilter(mechanism, angles, 1e-4, 1e-2, 1e-5)
+    linkage = LinkageFilter(
+        mechanism, assemble(mechanism, 3.0, 4.3), 1e-4, 1e-2, Randomness(1e-5, 1e-5, 1e-3))
+    rows = np.zeros((len(sensors), 10 + sum(sensor >= GYROS for sensor in sensors)))
+    # Joints 1 to 4: b to a, c to b, d to c, a to d.
+    of_links = np.vstack([np.eye(4), np.roll(np.eye(4), 1, axis=1) - np.eye(4)])
+    bias = 10
+    for row, sensor in zip(rows, sensors):
+        if sensor < GYROS:
+            row[:4] = of_links[sensor]
+        else:
+            row[4:8] = of_links[sensor - GYROS]
+            row[bias] = 1.0
+            bias += 1
+    # Hear of the gyros before they matter.
+    linkage.correct(sensors, np.zeros(len(sensors)), 1.0, gate=0.0)
+    textbook = textbook_of(linkage, len(sensors))
     linkage.move(PERIOD, mechanism.flywheel_inertias * rng.normal(size=4))
-    textbook = ExtendedKalmanFilter(dim_x=4, dim_z=len(sensors))
-    textbook.x, textbook.P = np.array([3.0, 4.3, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-2, 1e-2])
     textbook.F, textbook.Q = linkage.F, linkage.Q
     textbook.predict()
-    np.testing.assert_allclose(linkage.P, textbook.P, rtol=1e-12, atol=0.0)
+    np.testing.assert_allclose(linkage.P, textbook.P, rtol=1e-12, atol=1e-20)
 
     # From here on the same state, which the linkage moves better than F alone.
     textbook.x = linkage.x.copy()
-    # Joints 1 to 4: b to a, c to b, d to c, a to d.
-    of_links = np.vstack([np.eye(4), np.roll(np.eye(4), 1, axis=1) - np.eye(4)])[list(sensors)]
-    predicted = of_links @ linkage.angles
-    jacobian = np.zeros((len(sensors), 4))
-    jacobian[:, :2] = of_links @ np.vstack([np.eye(2), linkage.gamma])
-    measured = predicted + rng.normal(scale=1e-3, size=len(sensors)) - 2.0 * np.pi
-    variance = 3e-6
+    predicted = rows @ linkage.x
+    measured = predicted + rng.normal(scale=1e-3, size=len(sensors))
+    measured[np.array(sensors) < GYROS] -= 2.0 * np.pi
+    variances = rng.uniform(1e-6, 5e-6, len(sensors))
     textbook.update(
-        measured, lambda x: jacobian, lambda x: predicted, R=variance * np.eye(len(sensors)),
+        measured, lambda x: rows, lambda x: predicted, R=np.diag(variances),
         residual=lambda z, h: wrap_angles(z - h))
-    innovation, nis, used = linkage.correct(sensors, measured, variance)
-    assert used.all()
-    np.testing.assert_allclose(innovation, textbook.y, rtol=0.0, atol=1e-14)
-    np.testing.assert_allclose(linkage.x, textbook.x, rtol=1e-12, atol=1e-12)
+    seen = linkage.correct(sensors, measured, variances)
+    assert seen.used.all()
+    np.testing.assert_allclose(seen.innovation, textbook.y, rtol=0.0, atol=1e-14)
+    # Links c and d follow a and b by more than the first order.
+    free = [0, 1, 4, 5, *range(8, len(linkage.x))]
+    np.testing.assert_allclose(linkage.x[free], textbook.x[free], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(linkage.K, textbook.K, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(linkage.P, textbook.P, rtol=1e-12, atol=1e-18)
     # Wrapping by a turn leaves 1e-15 rad of innovations of 1e-3 rad.
-    assert nis == pytest.approx(textbook.mahalanobis ** 2, rel=1e-11)
+    assert seen.nis == pytest.approx(textbook.mahalanobis ** 2, rel=1e-11)

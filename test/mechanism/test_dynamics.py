@@ -81,7 +81,7 @@ def by_constrained_form(linkage: Mechanism, state: Array, torques: Array) -> Arr
     cosines, sines = directions(tuple(state[LINK_ANGLES]))
     return np.array(constrained_accelerations(
         state[0], cosines, sines, tuple(state[LINK_RATES]), (0.0, 0.0), torques,
-        linkage.constants, NOTHING)[0])
+        linkage.constants, NOTHING, True)[0])
 
 
 # --- Facts ------------------------------------------------------------------------------------

@@ -356,7 +356,7 @@ def test_reduced_and_constrained_solutions_agree(
         *state[CENTRE_VELOCITY], torques, linkage.constants, around)
     links, centre, total = constrained_accelerations(
         a, *directions((a, b, c, d)), tuple(state[LINK_RATES]), tuple(state[CENTRE_VELOCITY]),
-        torques, linkage.constants, around)
+        torques, linkage.constants, around, True)
     # A few hundred roundings, and the reduced form divides by the fold twice.
     np.testing.assert_allclose(reduced[:7], [*links, *centre, total], rtol=0.0,
                                atol=1e-12 / np.sin(d - c)**2 * max(1.0, np.abs(links).max()))

@@ -1,0 +1,143 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Kernel of the correction: what measured angles and rates make of the state."""
+
+from __future__ import annotations
+
+from math import pi
+
+from fourbar_ros.estimation.prediction import meet
+from fourbar_ros.estimation.suspicion import FAULTY, judge, seen_again, VERDICT, weigh
+from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.mechanism.constants import Array
+import numpy as np
+from numpy.typing import NDArray
+
+# What became of a sample.
+USED, REFUSED, LEFT_OUT = 0, 1, 2
+
+
+@kernel
+def correct(x: Array, covariance: Array, suspicions: Array, sensors: NDArray[np.int64],
+            rows: Array, measured: Array, variances: Array, gate: float,
+            spared: NDArray[np.bool_], boxed: NDArray[np.record], state: Array,
+            ) -> tuple[Array, Array, Array, Array, Array, float, NDArray[np.int64]]:
+    """
+    Correct in place: filterpy's `update`, with wrapped innovations and a gate for each sample.
+
+    :param x, covariance: (n,) and (n, n), see estimation.layout.
+    :param suspicions: (sensors, SCALARS + n), see estimation.suspicion.
+    :param sensors: (m,) of which sensor each sample is, below zero for a gyro's.
+    :param rows: (m, n) H.
+    :param measured: (m,) angles, any turn [rad], and rates [rad/s].
+    :param variances: (m,) of each.
+    :param gate: largest normalised square of an innovation that is used.
+    :param spared: (sensors,) those that are used even if found at fault.
+    :param boxed: (1,) constants of the mechanism, wheels locked.
+    :param state: (STATE_SIZE,) to work in.
+    :returns: y (m,), and the square of each over its variance (m,); of the k samples that were
+        used S (k, k), its inverse, K (n, k) and the normalised innovation squared; and what
+        became of each sample (m,).
+    """
+    count, size = rows.shape
+    y, squares, fate = np.empty(count), np.empty(count), np.zeros(count, np.int64)
+    spread = np.zeros((size, count))
+    used = 0
+    for m in range(count):
+        # P H', and the diagonal of S = H P H' + R.
+        predicted, variance = 0.0, variances[m]
+        for k in range(size):
+            share = rows[m, k]
+            if share != 0.0:
+                predicted += share * x[k]
+                for i in range(size):
+                    spread[i, m] += share * covariance[i, k]
+        for i in range(size):
+            variance += rows[m, i] * spread[i, m]
+        y[m] = measured[m] - predicted
+        if sensors[m] >= 0:
+            y[m] = pi - (pi - y[m]) % (2.0 * pi)
+        squares[m] = y[m] * y[m] / variance
+        if sensors[m] >= 0 and suspicions[sensors[m], VERDICT] == FAULTY:
+            fate[m] = LEFT_OUT
+            seen_again(suspicions[sensors[m]], squares[m])
+        elif not squares[m] <= gate:
+            fate[m] = REFUSED
+        else:
+            used += 1
+    s = np.empty((used, used))
+    if used == 0:
+        return y, squares, s, s, np.zeros((size, 0)), 0.0, fate
+    of, h, b = np.empty(used, np.int64), np.empty((used, size)), np.empty((size, used))
+    good, good_sensors = np.empty(used), np.empty(used, np.int64)
+    noise = np.empty(used)
+    n = 0
+    for m in range(count):
+        if fate[m] == USED:
+            of[n], good[n], good_sensors[n], noise[n] = m, y[m], sensors[m], variances[m]
+            h[n] = rows[m]
+            b[:, n] = spread[:, m]
+            n += 1
+    for m in range(used):
+        for n in range(used):
+            s[m, n] = noise[m] if m == n else 0.0
+            for i in range(size):
+                s[m, n] += h[m, i] * b[i, n]
+    inverse = np.linalg.inv(s)
+    gain = np.zeros((size, used))
+    for i in range(size):
+        for m in range(used):
+            for n in range(used):
+                gain[i, m] += b[i, n] * inverse[n, m]
+            x[i] += gain[i, m] * good[m]
+    _joseph(covariance, h, b, gain, noise)
+    nis = 0.0
+    for m in range(used):
+        for n in range(used):
+            nis += good[m] * inverse[m, n] * good[n]
+    weigh(suspicions, good_sensors, h, good, inverse, gain)
+    judge(x, covariance, suspicions, spared)
+    state[0:8] = x[0:8]
+    meet(state, covariance, boxed[0])
+    x[0:8] = state[0:8]
+    return y, squares, s, inverse, gain, nis, fate
+
+
+@kernel
+def _joseph(covariance: Array, h: Array, b: Array, gain: Array, noise: Array) -> None:
+    """
+    Set P = (I - K H) P (I - K H)' + K R K', in place.
+
+    :param b: (n, k) P H'.
+    :param noise: (k,) the diagonal of R.
+    """
+    size, used = b.shape
+    rest, back = np.empty((size, size)), np.zeros((size, used))
+    for i in range(size):
+        for k in range(size):
+            rest[i, k] = covariance[i, k]
+            for m in range(used):
+                rest[i, k] -= gain[i, m] * b[k, m]
+    for i in range(size):
+        for m in range(used):
+            for k in range(size):
+                back[i, m] += rest[i, k] * h[m, k]
+            back[i, m] -= gain[i, m] * noise[m]
+    for i in range(size):
+        for k in range(i + 1):
+            total = rest[i, k]
+            for m in range(used):
+                total -= back[i, m] * gain[k, m]
+            covariance[i, k] = covariance[k, i] = total

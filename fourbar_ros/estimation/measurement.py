@@ -1,0 +1,94 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What was measured at one time, as the estimator keeps it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isnan, nan
+from typing import NamedTuple
+
+from fourbar_ros.estimation.filter import GYROS
+from fourbar_ros.mechanism import JOINT_LINKS, SENSOR_NAMES
+from fourbar_ros.mechanism.angles import wrap
+from fourbar_ros.mechanism.by_name import values_by_name
+from fourbar_ros.mechanism.constants import Array
+import numpy as np
+
+
+class Measurement(NamedTuple):
+    """
+    Samples of one time, as they sort in time.
+
+    :param stamp_ns: of the measurement [ns].
+    :param sensors: indices of `SENSOR_NAMES`, then from `GYROS` on those of gyros.
+    :param values: (m,) angles, wrapped [rad], and rates [rad/s].
+    """
+
+    stamp_ns: int
+    sensors: tuple[int, ...]
+    values: Array
+
+    def in_time(self) -> tuple[int, tuple[int, ...]]:
+        """Sort by stamp, and samples of one stamp in an order that arrival has no part in."""
+        return self.stamp_ns, self.sensors
+
+    def angles(self) -> dict[int, float]:
+        """Return the angles [rad] by index of `SENSOR_NAMES`."""
+        return {sensor: value for sensor, value in zip(self.sensors, self.values.tolist())
+                if sensor < GYROS}
+
+    def without(self, sensors: set[int]) -> Measurement | None:
+        """Leave some sensors and their gyros out; None if nothing else was measured."""
+        kept = [n for n, sensor in enumerate(self.sensors) if sensor % GYROS not in sensors]
+        if not kept:
+            return None
+        return Measurement(
+            self.stamp_ns, tuple(self.sensors[n] for n in kept), self.values[kept])
+
+    def link_angles(self) -> Array:
+        """Work out the link angles (4,) that follow without the closure, NaN the others [rad]."""
+        measured = self.angles()
+        found = [measured.get(link, nan) for link in range(4)]
+        # Once around the loop from any link, either way.
+        for _ in range(3):
+            for sensor, (first, second) in enumerate(JOINT_LINKS, 4):
+                relative = measured.get(sensor, nan)
+                if isnan(found[second]):
+                    found[second] = found[first] + relative
+                if isnan(found[first]):
+                    found[first] = found[second] - relative
+        return np.array(found)
+
+
+def read_measurement(stamp_ns: int, names: Sequence[str], angles: Sequence[float],
+                     rates: Sequence[float]) -> Measurement:
+    """
+    Check what was measured, and sort it by sensor.
+
+    :param stamp_ns: time of measurement [ns].
+    :param names: any of `SENSOR_NAMES`, in any order.
+    :param angles: of each, any turn [rad].
+    :param rates: of each from its gyro [rad/s], or nothing.
+    :raises RejectedError: kinds `length`, `names`, `finite`.
+    """
+    measured = values_by_name(names, angles, SENSOR_NAMES, 'position')
+    sensors = sorted(measured)
+    values = [wrap(measured[sensor]) for sensor in sensors]
+    if len(rates):
+        measured = values_by_name(names, rates, SENSOR_NAMES, 'velocity')
+        values += [measured[sensor] for sensor in sensors]
+        sensors += [GYROS + sensor for sensor in sensors]
+    return Measurement(stamp_ns, tuple(sensors), np.array(values))
