@@ -27,6 +27,7 @@ from bisect import insort
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from math import isfinite, pi, sin
 from typing import NamedTuple
 
@@ -54,8 +55,10 @@ from fourbar_ros.estimation.health import SensorHealth
 from fourbar_ros.estimation.layout import ANGLES, BIASES, RATES, TORQUES
 from fourbar_ros.estimation.measurement import Measurement, read_measurement
 from fourbar_ros.estimation.settings import EstimatorSettings
-from fourbar_ros.mechanism import ClosureError, Mechanism, nearest_assembly, SENSOR_NAMES
+from fourbar_ros.mechanism import ClosureError, Mechanism, SENSOR_NAMES
+from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.mechanism.by_name import RejectedError
+from fourbar_ros.mechanism.closure import assemblies
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.constrained import project_onto_closure
 from fourbar_ros.mechanism.reduced import NEAR_ALIGNMENT
@@ -93,8 +96,10 @@ UNKNOWN_SHARE = 0.02
 BY_SPEED, BY_EFFORT, BY_COMMAND, BY_NOTHING = (
     'wheel speeds', 'wheel efforts', 'commanded efforts', 'nothing')
 
-# Link angles that should be near alignment are brought onto the closure by so many Newton steps.
+# Link angles that should be near alignment are brought onto the closure by so many Newton steps,
+# which end no farther from them than this [rad].
 NEWTON_STEPS = 5
+NEARBY = 0.1
 
 
 @dataclass(eq=False)
@@ -204,7 +209,10 @@ class Estimator:
             if error.kind in ('finite', 'late'):
                 reason = LATE if error.kind == 'late' else NOT_FINITE
                 for name in names:
-                    self._decide(Decision(SENSOR_NAMES.index(name), reason))
+                    sensor = SENSOR_NAMES.index(name)
+                    self._decide(Decision(sensor, reason))
+                    if reason == LATE and self._stamp_ns is not None:
+                        self._health.too_late(self._stamp_ns, sensor)
             raise
         if alive := self._alive(measurement):
             insort(self._pending, alive, key=Measurement.in_time)
@@ -236,9 +244,10 @@ class Estimator:
 
     def _alive(self, measurement: Measurement) -> Measurement | None:
         """Note the samples, and leave out those of a sensor that is stuck."""
-        stuck = set()
+        stuck, stamp_ns = set(), measurement.stamp_ns
+        arrived_ns = stamp_ns if self._stamp_ns is None else max(stamp_ns, self._stamp_ns)
         for sensor, angle in measurement.angles().items():
-            self._health.sample(measurement.stamp_ns, sensor, angle)
+            self._health.sample(stamp_ns, sensor, angle, arrived_ns)
             if self._health.stuck(sensor):
                 stuck.add(sensor)
                 self._decide(Decision(sensor, REPEATS))
@@ -550,18 +559,31 @@ class Estimator:
         """
         if abs(sin(measured[3] - measured[2])) < NEAR_ALIGNMENT:
             # Two angles do not tell the others here, but four tell what they are.
-            angles, rates = tuple(measured.tolist()), (0.0, 0.0, 0.0, 0.0)
+            near, rates = tuple(measured.tolist()), (0.0, 0.0, 0.0, 0.0)
             constants = self._mechanism.with_rigid_joints().constants
             for _ in range(NEWTON_STEPS):
-                angles, _ = project_onto_closure(angles, rates, constants, True)
-            return np.array(angles)
-        partners = measured[[2, 3, 0, 1]]
-        near = np.where(np.isnan(measured), partners, measured)
-        known = [link for link in range(4) if not np.isnan(measured[link])]
-        # Two that are not opposite: opposite ones may say the same.
-        pair = (known[0], known[1]) if known[1] - known[0] != 2 else (known[0], known[2])
-        return nearest_assembly(
-            self._mechanism, pair, (measured[pair[0]], measured[pair[1]]), near)
+                near, _ = project_onto_closure(near, rates, constants, True)
+            if np.abs(near - measured).max() < NEARBY:
+                return np.array(near)
+        known = [link for link in range(4) if isfinite(measured[link])]
+        found: list[Array] = []
+        failure = None
+        # Opposite links of a parallelogram say the same, and folded ones leave the others free.
+        for first, second in combinations(known, 2):
+            try:
+                found += assemblies(self._mechanism, (first, second),
+                                    (measured[first], measured[second]), np.nan_to_num(measured))
+            except ClosureError as error:
+                failure = failure or error
+        best, farthest = None, max(NEARBY, 10.0 * self._settings.angle_noise)
+        for angles in found:
+            off = float(np.abs(wrap_angles(angles - measured)[known]).max())
+            if off < farthest:
+                best, farthest = angles, off
+        if best is None:
+            raise failure or ClosureError(
+                f'no assembly is within {farthest:.2g} rad of what was measured')
+        return best
 
     def _check_time(self, measurement: Measurement) -> None:
         """Refuse what comes too late, and what came already."""

@@ -177,7 +177,10 @@ def judge(x: Array, covariance: Array, suspicions: Array, spared: NDArray[np.boo
     suspicion[VERDICT], suspicion[MISFIT] = FAULTY, LARGEST_SQUARE
     # The others' sums are about a filter that believed this one.
     for sensor in range(suspicions.shape[0]):
-        begin_anew(suspicions[sensor])
+        if suspicions[sensor, VERDICT] != FAULTY:
+            begin_anew(suspicions[sensor])
+    begin_anew(suspicion)
+    suspicion[BIAS] = bias
     return True
 
 

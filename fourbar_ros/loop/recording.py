@@ -44,7 +44,9 @@ COLUMNS = (
     ('sigma_link_', 'estimate/sigma', 'position', LINKS),
     ('sigma_rate_', 'estimate/sigma', 'velocity', LINKS),
     ('', 'estimate/innovation', 'position',
-     (*QUALITY, *(f'innovation_{name}' for name in (*LINKS, *JOINT_NAMES)))),
+     (*QUALITY, *(f'innovation_{kind}{name}' for kind in ('', 'gyro_')
+                  for name in (*LINKS, *JOINT_NAMES)))),
+    ('disturbance_', 'estimate/disturbance', 'position', ('a', 'b', 'sigma_a', 'sigma_b')),
     ('reference_link_', 'reference', 'position', LINKS),
     ('reference_rate_', 'reference', 'velocity', LINKS),
     ('error_link_', 'tracking_error', 'position', LINKS),
@@ -95,10 +97,12 @@ class Recording:
                       velocity=estimate.link_rates)
             self._row('estimate/sigma', now, now, position=estimate.angle_sigmas,
                       velocity=estimate.rate_sigmas)
+            self._row('estimate/disturbance', now, now, position=np.concatenate(
+                [estimate.disturbance, estimate.disturbance_sigmas]))
             if (seen := estimate.innovation) is not None:
                 self._row('estimate/innovation', now, now, position=np.concatenate(
                     [[seen.nis, seen.degrees_of_freedom],
-                     _spread(seen.sensors, seen.angles, len(SENSOR_NAMES))]))
+                     _spread(seen.sensors, seen.values, 2 * len(SENSOR_NAMES))]))
         if (control := step.control) is not None:
             self._row('flywheel_command', now, now, effort=control.torques)
             self._row('reference', now, now, position=control.reference_angles,

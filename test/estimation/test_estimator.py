@@ -168,7 +168,7 @@ def test_any_subset_of_links_keeps_it_going(links: tuple[int, ...], uneven: Mech
     for estimate in run.ticks(100, links):
         assert estimate.innovation is not None
         assert estimate.innovation.sensors == links
-        assert estimate.innovation.angles.shape == (len(links),)
+        assert estimate.innovation.values.shape == (len(links),)
         assert np.abs(run.unwrapped_error(estimate)).max() < SIGMAS * max(estimate.angle_sigmas)
 
 
@@ -215,13 +215,13 @@ def names_of(*links: int) -> list[str]:
 
 
 @pytest.mark.parametrize('branch', ['open', 'crossed'])
-@pytest.mark.parametrize('third', [2, 3])
-def test_three_links_tell_the_branch(mechanism: Mechanism, branch: str, third: int) -> None:
+@pytest.mark.parametrize('missing', range(4))
+def test_three_links_tell_the_branch(mechanism: Mechanism, branch: str, missing: int) -> None:
     angles = angles_of(mechanism, branch)
     for seed in range(20):
         rng = np.random.default_rng(seed)
         estimator = Estimator(mechanism, EstimatorSettings())
-        links = rng.permutation([0, 1, third])
+        links = rng.permutation([link for link in range(4) if link != missing])
         measured = angles[links] + NOISE * rng.standard_normal(3)
         estimator.measure(FIRST_NS, names_of(*links), list(measured))
         estimate = estimator.tick(FIRST_NS, STILL)
@@ -231,13 +231,13 @@ def test_three_links_tell_the_branch(mechanism: Mechanism, branch: str, third: i
         assert np.abs(wrapped).max() < 4.0 * 3.0 * NOISE, f'seed {seed}'
 
 
-@pytest.mark.parametrize('links', [(0,), (0, 1), (0, 2, 3), (1, 2, 3), (2, 3)])
+@pytest.mark.parametrize('links', [(0,), (0, 1), (0, 2), (1, 3), (2, 3)])
 def test_fewer_do_not_start_it(links: tuple[int, ...], paper: Mechanism) -> None:
     estimator = Estimator(paper, EstimatorSettings())
     assert estimator.waiting_for == 'flywheel_states'
     estimator.measure(FIRST_NS, names_of(*links), list(angles_of(paper, 'open')[list(links)]))
     assert estimator.tick(FIRST_NS, STILL) is None
-    assert 'link_a, link_b and one of link_c, link_d' in estimator.waiting_for
+    assert 'three of the four links' in estimator.waiting_for
     assert estimator.starts == 0
 
 
@@ -332,7 +332,7 @@ def test_sample_of_the_last_tick_still_serves_the_next(running: Run) -> None:
     assert estimate.innovation is not None
 
 
-@pytest.mark.parametrize('speeds', [[0.0] * 3, [0.0] * 5, [], [0.0, nan, 0.0, 0.0],
+@pytest.mark.parametrize('speeds', [[0.0] * 3, [0.0] * 5, [0.0, nan, 0.0, 0.0],
                                     [inf, 0.0, 0.0, 0.0]])
 def test_unusable_wheel_speeds_are_rejected(speeds: list[float], running: Run) -> None:
     with pytest.raises(RejectedError) as caught:
@@ -487,13 +487,15 @@ def test_stuck_sensor_is_named_at_once_and_left_out(sensor: int, mechanism: Mech
     run.after(250)
     run.plant.link_sensors.set_faults({LINK_NAMES[sensor]: Fault(LINK_NAMES[sensor], 'stuck')})
     run.after(48)
-    assert run.estimator.sensor_faults() == {}
+    # Frozen at a sample that is far off it may be found at fault before, for that.
+    assert 'repeats one value' not in run.estimator.sensor_faults().values()
     estimate = run.after(1)
     assert run.estimator.sensor_faults() == {LINK_NAMES[sensor]: 'repeats one value'}
     assert estimate.innovation is not None
     assert estimate.innovation.sensors == tuple(link for link in range(4) if link != sensor)
     run.plant.link_sensors.set_faults({})
     assert len(run.after(1).innovation.sensors) == 4
+    run.after(250)
     assert run.estimator.sensor_faults() == {}
 
 

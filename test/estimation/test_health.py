@@ -96,11 +96,12 @@ def test_one_silence_is_no_loss_of_samples() -> None:
 def test_far_off_is_a_matter_of_many_samples() -> None:
     health, now_ns = watched({0: noisy(5), 1: noisy(5)})
     for _ in range(5):
-        health.judged((0, 1), (True, False))
+        health.judged(0, False)
+        health.judged(1, True)
     assert health.faults(now_ns) == {}
     # One more: 1 - (24/25)^6 = 0.22.
-    health.judged((0, 1), (True, False))
+    health.judged(1, True)
     assert health.faults(now_ns) == {'link_b': 'samples far off'}
     for _ in range(3):
-        health.judged((0, 1), (True, True))
+        health.judged(1, False)
     assert health.faults(now_ns) == {}
