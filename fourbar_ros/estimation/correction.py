@@ -95,7 +95,8 @@ def correct(x: Array, covariance: Array, suspicions: Array, sensors: NDArray[np.
             s[m, n] = noise[m] if m == n else 0.0
             for i in range(size):
                 s[m, n] += h[m, i] * b[i, n]
-    inverse = np.linalg.inv(s)
+    inverse = np.empty_like(s)
+    inverse[:] = np.linalg.inv(s)
     gain = np.zeros((size, used))
     for i in range(size):
         for m in range(used):

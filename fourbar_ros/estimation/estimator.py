@@ -31,6 +31,7 @@ from itertools import combinations
 from math import isfinite, pi, sin
 from typing import NamedTuple
 
+from fourbar_ros.estimation.correction import LEFT_OUT, REFUSED
 from fourbar_ros.estimation.estimate import (
     ACCEPTED,
     Decision,
@@ -43,14 +44,7 @@ from fourbar_ros.estimation.estimate import (
     NOT_FINITE,
     REPEATS,
 )
-from fourbar_ros.estimation.filter import (
-    Correction,
-    GYROS,
-    LEFT_OUT,
-    LinkageFilter,
-    REFUSED,
-    Snapshot,
-)
+from fourbar_ros.estimation.filter import Correction, GYROS, LinkageFilter, Snapshot
 from fourbar_ros.estimation.health import SensorHealth
 from fourbar_ros.estimation.layout import ANGLES, BIASES, RATES, TORQUES
 from fourbar_ros.estimation.measurement import Measurement, read_measurement

@@ -27,7 +27,7 @@ from math import inf, sqrt
 from typing import NamedTuple
 
 from filterpy.kalman import ExtendedKalmanFilter
-from fourbar_ros.estimation.correction import correct, LEFT_OUT, REFUSED, USED
+from fourbar_ros.estimation.correction import correct, USED
 from fourbar_ros.estimation.layout import ANGLES, BIASES, FREE, RATES, TORQUES
 from fourbar_ros.estimation.prediction import near_change_point, predict
 from fourbar_ros.estimation.suspicion import BIAS, FAULTY, no_suspicions, SUSPECTED, VERDICT
@@ -90,7 +90,8 @@ class Correction(NamedTuple):
     @property
     def used(self) -> NDArray[np.bool_]:
         """Tell which were used (m,)."""
-        return self.fate == USED
+        used: NDArray[np.bool_] = self.fate == USED
+        return used
 
 
 class _Layout(NamedTuple):

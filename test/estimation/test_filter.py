@@ -98,7 +98,8 @@ def test_prediction_and_transition_are_those_of_the_linkage(
         ends = [independent_end(mechanism, start + sign * width * np.eye(4)[column], angles,
                                 torques, duration) for sign in (1.0, -1.0)]
         transition[:, column] = (ends[0] - ends[1]) / (2.0 * width)
-    np.testing.assert_allclose(linkage.F[FREE[:, None], FREE], transition, rtol=0.0, atol=5e-8 + 10.0 * model)
+    np.testing.assert_allclose(
+        linkage.F[FREE[:, None], FREE], transition, rtol=0.0, atol=5e-8 + 10.0 * model)
 
 
 def test_wheel_motion_predicts_the_plant(mechanism: Mechanism) -> None:
@@ -150,7 +151,8 @@ def monte_carlo(mechanism: Mechanism, seed: int) -> Consistency:
     constants = mechanism.constants_with(np.ones(4, dtype=bool))
     for run in range(RUNS):
         angles = assemble(mechanism, 0.2, 1.5)
-        linkage = LinkageFilter(mechanism, angles, NOISE ** 2, START_RATE ** 2, Randomness(DISTURBANCE))
+        linkage = LinkageFilter(
+            mechanism, angles, NOISE ** 2, START_RATE ** 2, Randomness(DISTURBANCE))
         start = linkage.x[FREE] + rng.standard_normal(4) * linkage.sigmas()[FREE]
         state = np.zeros(STATE_SIZE)
         state[:4] = nearest_assembly(mechanism, (0, 1), (start[0], start[1]), angles)
