@@ -31,6 +31,7 @@ from fourbar_ros.mechanism.compiled import kernel
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.constrained import (
     advance_constrained,
+    combine,
     directions,
     dot,
     factored_inertia,
@@ -94,8 +95,9 @@ def predict(x: Array, covariance: Array, suspicions: Array, wheel_torques: Array
         noise[i, i] = densities[2] * densities[2] * duration
     near = near_change_point(x)
     if near:
-        _linearise_four(x, duration, densities, constants, transition, noise)
-        _move(x, wheel_torques, duration, weak_is_held(x, covariance, constants), constants, state)
+        held = weak_is_held(x, covariance, constants)
+        _linearise_four(x, duration, densities, held, constants, transition, noise)
+        _move(x, wheel_torques, duration, held, constants, state)
     else:
         _linearise_two(x, wheel_torques, duration, constants, state, transition)
         _noise_of_two(x, state, duration, densities, constants, noise)
@@ -309,15 +311,15 @@ def _noise_of_two(x: Array, end: Array, duration: float, densities: Array, const
 
 
 @kernel
-def _linearise_four(x: Array, duration: float, densities: Array, constants: Constants,
-                    transition: Array, noise: Array) -> None:
+def _linearise_four(x: Array, duration: float, densities: Array, weak_held: bool,
+                    constants: Constants, transition: Array, noise: Array) -> None:
     """
-    Evaluate transition and noise of four links of which only the strong constraint is certain.
+    Evaluate transition and noise of all four links.
 
     That rates change with angles and rates is left out: over a step it is less than what the
     closure says afterwards.
     """
-    mobility = _mobility(x, constants)
+    mobility = _mobility(x, weak_held, constants)
     white, walk = densities[0] * densities[0], densities[1] * densities[1]
     t = duration
     for i in range(4):
@@ -342,22 +344,21 @@ def _linearise_four(x: Array, duration: float, densities: Array, constants: Cons
 
 
 @kernel
-def _mobility(x: Array, constants: Constants) -> Array:
-    """Evaluate accelerations per torque (4, 4) under the strong constraint [1/(kg m^2)]."""
+def _mobility(x: Array, weak_held: bool, constants: Constants) -> Array:
+    """Evaluate accelerations of the links per torque on each (4, 4) [1/(kg m^2)]."""
     cosines, sines = directions((x[0], x[1], x[2], x[3]))
     factor, _ = factored_inertia(cosines, sines, (0.0, 0.0, 0.0, 0.0), constants)
     px, py = signed_links(cosines, sines, constants.lengths)
-    strong, _, _, _ = orthogonal_columns(factor, px, py)
-    size = dot(strong, strong)
+    strong, weak, _, _ = orthogonal_columns(factor, px, py)
     mobility = np.empty((4, 4))
     for link in range(4):
         unit = (1.0 if link == 0 else 0.0, 1.0 if link == 1 else 0.0,
                 1.0 if link == 2 else 0.0, 1.0 if link == 3 else 0.0)
         free = solve_lower(factor, unit)
-        along = dot(free, strong) / size
-        column = solve_upper(factor, (
-            free[0] - along * strong[0], free[1] - along * strong[1],
-            free[2] - along * strong[2], free[3] - along * strong[3]))
+        allowed = combine(1.0, free, -dot(free, strong) / dot(strong, strong), strong)
+        if weak_held:
+            allowed = combine(1.0, allowed, -dot(free, weak) / dot(weak, weak), weak)
+        column = solve_upper(factor, allowed)
         for j in range(4):
             mobility[j, link] = column[j]
     return mobility

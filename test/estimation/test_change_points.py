@@ -1,0 +1,179 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+At change points the filter knows what it does not know, and the sensors tell the branch.
+
+The prototype's linkage has equal opposite links: at theta = phi_b - phi_a = 0 and pi all four lie
+on a line, and psi = phi_c - phi_a is free there besides theta.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from fourbar_ros.estimation import Estimate, Estimator, EstimatorSettings
+from fourbar_ros.estimation.filter import LinkageFilter, Randomness
+from fourbar_ros.mechanism import load_mechanism, Mechanism
+from fourbar_ros.mechanism.angles import wrap_angles
+from fourbar_ros.mechanism.forces import NOTHING
+from fourbar_ros.mechanism.layout import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
+from fourbar_ros.mechanism.motion import move_held
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+from scipy import stats
+
+Array = NDArray[np.float64]
+
+PERIOD_NS = 4_000_000
+PERIOD = 4e-3
+NOISE = 1.7453e-3
+SETTINGS = EstimatorSettings(
+    angle_noise=NOISE, counts_per_turn=0, disturbance_torque=1e-5, disturbance_walk=1e-5)
+# A thousand numbers exceed 5 sigma with p = 0.0006, if all is well.
+SIGMAS = 5.0
+SEEDS = range(3)
+
+
+@pytest.fixture(scope='module')
+def mechanism() -> Mechanism:
+    """Load the linkage of the prototype."""
+    return load_mechanism('prototype')
+
+
+class Moment(NamedTuple):
+    """What is at a tick: angles and rates of the links in truth, and what is thought of them."""
+
+    angles: Array
+    rates: Array
+    estimate: Estimate
+
+    def deviations(self) -> Array:
+        """Return the errors of angles and rates in sigmas (8,)."""
+        estimate = self.estimate
+        return np.concatenate([
+            wrap_angles(estimate.link_angles - self.angles) / estimate.angle_sigmas,
+            (estimate.link_rates - self.rates) / estimate.rate_sigmas])
+
+
+def watch(mechanism: Mechanism, angles: Array, rates: Array, torques: Callable[[float], Array],
+          seconds: float, seed: int, sensors: tuple[int, ...] = (0, 1, 2, 3)
+          ) -> tuple[Estimator, Iterator[Moment]]:
+    """Let the linkage go from anywhere, also from change points, and an estimator watch it."""
+    rng = np.random.default_rng(seed)
+    estimator = Estimator(mechanism, SETTINGS)
+    names = [('link_a', 'link_b', 'link_c', 'link_d')[sensor] for sensor in sensors]
+
+    def moments() -> Iterator[Moment]:
+        state = make_state(angles, rates)
+        stamp_ns = 10 ** 9
+        speed = state[WHEEL_SPEEDS] - state[LINK_RATES]
+        for n in range(round(seconds / PERIOD)):
+            before = speed
+            move_held(state, torques(n * PERIOD), 5e-4, 8, mechanism.constants, NOTHING)
+            speed = state[WHEEL_SPEEDS] - state[LINK_RATES]
+            stamp_ns += PERIOD_NS
+            estimator.measure(stamp_ns, names, list(
+                state[LINK_ANGLES][list(sensors)] + NOISE * rng.standard_normal(len(sensors))))
+            estimate = estimator.tick(stamp_ns, list(0.5 * (before + speed)))
+            assert estimate is not None, f'seed {seed}'
+            yield Moment(state[LINK_ANGLES].copy(), state[LINK_RATES].copy(), estimate)
+    return estimator, moments()
+
+
+def at_rest(_: float) -> Array:
+    return np.zeros(4)
+
+
+def settled(estimator: Estimator, moments: Iterator[Moment], seed: int) -> list[Moment]:
+    """Go through all; errors must stay within their sigmas, NIS be that of noise."""
+    everything = list(moments)[100:]
+    deviations = np.array([moment.deviations() for moment in everything])
+    assert np.abs(deviations).max() < SIGMAS, f'seed {seed}'
+    innovations = [moment.estimate.innovation for moment in everything]
+    nis = sum(seen.nis for seen in innovations if seen is not None)
+    freedom = sum(seen.degrees_of_freedom for seen in innovations if seen is not None)
+    low, high = stats.chi2.interval(0.9999, freedom)
+    assert low < nis < high, f'seed {seed}'
+    assert estimator.starts == 1
+    assert estimator.sensor_faults() == {}
+    return everything
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+@pytest.mark.parametrize('aligned', [0.0, np.pi], ids=['0', 'pi'])
+@pytest.mark.parametrize(('before', 'rate'), [(-0.4, 0.6), (-0.06, 0.02), (0.4, -2.0)])
+def test_passage(seed: int, aligned: float, before: float, rate: float, mechanism: Mechanism
+                 ) -> None:
+    """Fast and slow, on the branch of the motion."""
+    angles = np.array([0.2, 0.2, 0.2, 0.2]) + (aligned + before) * np.array([0, 1, 0, 1])
+    rates = rate * np.array([0.0, 1.0, 0.0, 1.0])
+    last = settled(*watch(mechanism, angles, rates, at_rest, 1.0 + 2.0 * abs(before / rate), seed),
+                   seed)[-1]
+    assert (last.angles[1] - 0.2 - aligned) * before < 0.0
+    np.testing.assert_allclose(wrap_angles(last.angles[2] - last.angles[0]), 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_folding_at_a_change_point_is_followed(seed: int, mechanism: Mechanism) -> None:
+    """Opposite torques on opposite wheels turn it onto the branch on which b stays on a."""
+    end = settled(*watch(
+        mechanism, np.full(4, 0.2), np.zeros(4),
+        lambda t: 2e-3 * np.sin(3.0 * t) * np.array([1.0, 1.0, -1.0, -1.0]), 3.0, seed), seed)[-1]
+    assert abs(end.angles[1] - end.angles[0]) < 1e-6
+    assert abs(end.angles[2] - end.angles[0]) > 0.4
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+@pytest.mark.parametrize('theta', [0.0, 0.002, 0.05, np.pi - 0.01])
+def test_start_at_or_near_one(seed: int, theta: float, mechanism: Mechanism) -> None:
+    """From what is measured, while the whole turns."""
+    angles = 0.2 + theta * np.array([0.0, 1.0, 0.0, 1.0])
+    settled(*watch(mechanism, angles, np.full(4, 0.3), at_rest, 2.0, seed), seed)
+
+
+def test_three_sensors_are_enough(mechanism: Mechanism) -> None:
+    """Where three motions are free, three angles tell them."""
+    angles = 0.2 - 0.3 * np.array([0.0, 1.0, 0.0, 1.0])
+    settled(*watch(mechanism, angles, 0.5 * np.array([0.0, 1.0, 0.0, 1.0]), at_rest, 1.5, 1,
+                   (0, 1, 3)), 1)
+
+
+def test_free_motion_is_known_less_well_where_nothing_constrains_it(mechanism: Mechanism) -> None:
+    """With two sensors at theta = 0, c and d are as uncertain as the closure leaves them."""
+    sigmas = []
+    for theta in (0.0, 0.3):
+        linkage = LinkageFilter(mechanism, 0.2 + theta * np.array([0.0, 1.0, 0.0, 1.0]), 1e-2,
+                                1e-2, Randomness(1e-5))
+        for _ in range(20):
+            linkage.correct((0, 1), linkage.angles[:2], NOISE ** 2)
+            linkage.move(PERIOD, np.zeros(4))
+        sigmas.append(linkage.sigmas()[:4])
+    assert (sigmas[0][:2] < NOISE).all() and (sigmas[1] < NOISE).all()
+    assert (sigmas[0][2:] > 0.05).all()
+
+
+def test_covariance_near_and_away_is_the_same(mechanism: Mechanism) -> None:
+    """Where both descriptions hold, by turns of theta just inside and outside the limit."""
+    sigmas = []
+    for sine in (0.29, 0.31):
+        theta = np.arcsin(sine)
+        linkage = LinkageFilter(mechanism, 0.2 + theta * np.array([0.0, 1.0, 0.0, 1.0]), 1e-4,
+                                1e-2, Randomness(1e-4, 1e-4))
+        for _ in range(250):
+            linkage.correct((0, 1, 2, 3), linkage.angles, NOISE ** 2)
+            linkage.move(PERIOD, np.zeros(4))
+        sigmas.append(linkage.sigmas())
+    # The mass matrix of this linkage does not depend on theta.
+    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=1e-3)
