@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from math import pi
+from math import pi, sqrt
 
 from fourbar_ros.estimation.prediction import meet
 from fourbar_ros.estimation.suspicion import FAULTY, judge, seen_again, VERDICT, weigh
@@ -38,7 +38,7 @@ def correct(x: Array, covariance: Array, suspicions: Array, sensors: NDArray[np.
     Correct in place: filterpy's `update`, with wrapped innovations and a gate for each sample.
 
     :param x, covariance: (n,) and (n, n), see estimation.layout.
-    :param suspicions: (sensors, SCALARS + n), see estimation.suspicion.
+    :param suspicions: (2 sensors, SCALARS + n), see estimation.suspicion.
     :param sensors: (m,) of which sensor each sample is, below zero for a gyro's.
     :param rows: (m, n) H.
     :param measured: (m,) angles, any turn [rad], and rates [rad/s].
@@ -72,7 +72,7 @@ def correct(x: Array, covariance: Array, suspicions: Array, sensors: NDArray[np.
         squares[m] = y[m] * y[m] / variance
         if sensors[m] >= 0 and suspicions[sensors[m], VERDICT] == FAULTY:
             fate[m] = LEFT_OUT
-            seen_again(suspicions[sensors[m]], squares[m])
+            seen_again(suspicions, sensors[m], squares[m])
         elif not squares[m] <= gate:
             fate[m] = REFUSED
         else:
@@ -80,13 +80,12 @@ def correct(x: Array, covariance: Array, suspicions: Array, sensors: NDArray[np.
     s = np.empty((used, used))
     if used == 0:
         return y, squares, s, s, np.zeros((size, 0)), 0.0, fate
-    of, h, b = np.empty(used, np.int64), np.empty((used, size)), np.empty((size, used))
-    good, good_sensors = np.empty(used), np.empty(used, np.int64)
-    noise = np.empty(used)
+    h, b = np.empty((used, size)), np.empty((size, used))
+    good, noise = np.empty(used), np.empty(used)
     n = 0
     for m in range(count):
         if fate[m] == USED:
-            of[n], good[n], good_sensors[n], noise[n] = m, y[m], sensors[m], variances[m]
+            good[n], noise[n] = y[m], variances[m]
             h[n] = rows[m]
             b[:, n] = spread[:, m]
             n += 1
@@ -103,12 +102,16 @@ def correct(x: Array, covariance: Array, suspicions: Array, sensors: NDArray[np.
             for n in range(used):
                 gain[i, m] += b[i, n] * inverse[n, m]
             x[i] += gain[i, m] * good[m]
+    before = covariance if used == count else covariance.copy()
     _joseph(covariance, h, b, gain, noise)
     nis = 0.0
     for m in range(used):
         for n in range(used):
             nis += good[m] * inverse[m, n] * good[n]
-    weigh(suspicions, good_sensors, h, good, inverse, gain)
+    if used == count:
+        weigh(suspicions, sensors, h, good, inverse, gain)
+    else:
+        _weigh_refused(suspicions, sensors, rows, y, squares, variances, gate, fate, before, gain)
     judge(x, covariance, suspicions, spared)
     state[0:8] = x[0:8]
     meet(state, covariance, boxed[0])
@@ -142,3 +145,32 @@ def _joseph(covariance: Array, h: Array, b: Array, gain: Array, noise: Array) ->
             for m in range(used):
                 total -= back[i, m] * gain[k, m]
             covariance[i, k] = covariance[k, i] = total
+
+
+@kernel
+def _weigh_refused(suspicions: Array, sensors: NDArray[np.int64], rows: Array, y: Array,
+                   squares: Array, variances: Array, gate: float, fate: NDArray[np.int64],
+                   covariance: Array, gain: Array) -> None:
+    """
+    Weigh suspicions by all samples but those left out, though only some moved the filter.
+
+    What the gate refuses speaks of its sensor, too, but one sample, wherever it lies, as loudly
+    as one at the gate.
+
+    :param covariance: before the correction.
+    :param gain: of the samples that were used.
+    """
+    heard = np.flatnonzero(fate != LEFT_OUT)
+    many, size = heard.size, rows.shape[1]
+    h, innovation, full = rows[heard], y[heard], np.zeros((size, many))
+    s = h @ covariance @ h.T
+    column = 0
+    for n in range(many):
+        m = heard[n]
+        s[n, n] += variances[m]
+        if fate[m] == USED:
+            full[:, n] = gain[:, column]
+            column += 1
+        else:
+            innovation[n] *= sqrt(gate / squares[m])
+    weigh(suspicions, sensors[heard], h, innovation, np.linalg.inv(s), full)

@@ -225,15 +225,17 @@ class Estimator:
         """Tell at the last tick what is wrong with sensors: a few words by the sensor's name."""
         if self._stamp_ns is None:
             return {}
-        found = {}
-        if self._filter is not None:
-            suspected = self._filter.suspected()
-            for sensor, error in suspected.items():
-                others = [SENSOR_NAMES[other] for other in suspected if other != sensor]
-                found[SENSOR_NAMES[sensor]] = _off_by(error, others)
-            for sensor, error in self._filter.faulty().items():
-                found[SENSOR_NAMES[sensor]] = _off_by(error, [])
-        found.update(self._health.faults(self._stamp_ns))
+        found = self._health.faults(self._stamp_ns)
+        if self._filter is None:
+            return found
+        for sensor, error in self._filter.faulty().items():
+            found.setdefault(SENSOR_NAMES[sensor], _off_by(error, []))
+        suspected = self._filter.suspected()
+        names = [SENSOR_NAMES[sensor] for sensor in suspected]
+        if found.keys().isdisjoint(names):
+            # Else it is known which of them it is.
+            for name, error in zip(names, suspected.values()):
+                found[name] = _off_by(error, [other for other in names if other != name])
         return found
 
     def _alive(self, measurement: Measurement) -> Measurement | None:
@@ -472,7 +474,7 @@ class Estimator:
             if fate == REFUSED:
                 self.gated[_name(sensor)] += 1
             if sensor < GYROS:
-                self._health.judged(sensor, fate == REFUSED)
+                self._health.judged(sensor, square > self._gate)
                 reason = {REFUSED: GATED, LEFT_OUT: FAULTY}.get(fate, ACCEPTED)
                 self._decide(Decision(sensor, reason, square))
         return Innovation(sensors, seen.innovation, seen.used, seen.nis)

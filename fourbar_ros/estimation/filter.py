@@ -30,7 +30,14 @@ from filterpy.kalman import ExtendedKalmanFilter
 from fourbar_ros.estimation.correction import correct, USED
 from fourbar_ros.estimation.layout import ANGLES, BIASES, FREE, RATES, TORQUES
 from fourbar_ros.estimation.prediction import near_change_point, predict
-from fourbar_ros.estimation.suspicion import BIAS, FAULTY, no_suspicions, SUSPECTED, VERDICT
+from fourbar_ros.estimation.suspicion import (
+    BIAS,
+    FAULTY,
+    LIKELIHOOD,
+    no_suspicions,
+    SUSPECTED,
+    VERDICT,
+)
 from fourbar_ros.mechanism import JOINT_LINKS, Mechanism, SENSOR_NAMES
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix
@@ -237,8 +244,11 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         return np.vstack([np.eye(2), gamma_matrix(self.x, self._lengths)])
 
     def _with_verdict(self, verdict: float) -> dict[int, float]:
-        found = np.flatnonzero(self._suspicions[:, VERDICT] == verdict)
-        return {int(sensor): float(self._suspicions[sensor, BIAS]) for sensor in found}
+        table, found = self._suspicions, {}
+        for sensor in np.flatnonzero(table[:GYROS, VERDICT] == verdict).tolist():
+            old = table[GYROS + sensor, LIKELIHOOD] > table[sensor, LIKELIHOOD]
+            found[sensor] = float(table[sensor + GYROS * old, BIAS])
+        return found
 
     def _layout(self, sensors: tuple[int, ...]) -> _Layout:
         for gyro in sensors:

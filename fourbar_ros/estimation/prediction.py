@@ -76,7 +76,7 @@ def predict(x: Array, covariance: Array, suspicions: Array, wheel_torques: Array
     Predict in place: filterpy's `predict` with the linkage as the model.
 
     :param x, covariance: (n,) and (n, n), see estimation.layout.
-    :param suspicions: (sensors, n + SCALARS), see estimation.suspicion.
+    :param suspicions: (2 sensors, SCALARS + n), see estimation.suspicion.
     :param wheel_torques: (4,) If dOmega/dt of the wheels, relative to their links [N m].
     :param duration: [s].
     :param densities: (3,) of random torques on each link [N m/sqrt(Hz)], and of the random walks
@@ -102,8 +102,8 @@ def predict(x: Array, covariance: Array, suspicions: Array, wheel_torques: Array
         _linearise_two(x, wheel_torques, duration, constants, state, transition)
         _noise_of_two(x, state, duration, densities, constants, noise)
     _carry(covariance, transition, noise, near)
-    for sensor in range(suspicions.shape[0]):
-        carry_suspicion(suspicions[sensor], transition, duration)
+    for n in range(suspicions.shape[0]):
+        carry_suspicion(suspicions[n], transition, duration)
     x[0:8] = state[0:8]
     if near:
         condition(x, covariance, suspicions, constants)
@@ -196,8 +196,8 @@ def condition(x: Array, covariance: Array, suspicions: Array, constants: Constan
         for i in range(size):
             for k in range(size):
                 covariance[i, k] -= known[i] * known[k] / variance
-        for sensor in range(suspicions.shape[0]):
-            effect = suspicions[sensor, SCALARS:]
+        for suspicion in suspicions:
+            effect = suspicion[SCALARS:]
             seen = 0.0
             for k in range(8):
                 seen += row[k] * effect[k]

@@ -16,12 +16,13 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 from math import inf, nan, pi
 from typing import Any
 
-from fourbar_ros.estimation import Estimate, Estimator, EstimatorSettings
+from fourbar_ros.estimation import DECISIONS, Estimate, Estimator, EstimatorSettings
 from fourbar_ros.mechanism import assemble, branch_of, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.plant import Fault, InitialState, Plant, Table
@@ -66,7 +67,8 @@ class Run:
             reading, = self.plant.link_sensors.due(self.stamp_ns)
             self.estimator.measure(
                 self.stamp_ns, [names[sensor] for sensor in chosen],
-                list((reading.angles + (0.0 if offsets is None else offsets))[list(chosen)]))
+                list((reading.angles + (0.0 if offsets is None else offsets))[list(chosen)]),
+                list(reading.rates))
         return self.estimator.tick(self.stamp_ns, list(speeds))
 
     def ticks(self, count: int, *args: Any) -> Iterator[Estimate]:
@@ -705,3 +707,213 @@ def test_new_start_in_the_same_run_stays_on_its_turn(paper: Mechanism) -> None:
     after = elsewhere.after(30)
     assert run.estimator.starts == 2
     assert np.abs(after.link_angles - before.link_angles).max() < 1.5 * pi
+
+
+# Constant errors, too small for the gate
+
+def named(run: Run, ticks: int, offsets: Array, wrong: int) -> tuple[float, float]:
+    """Let sensors be off; return after what time the wrong one alone is named, and the error."""
+    after, worst = inf, 0.0
+    for n in range(ticks):
+        estimate = run.tick(None, None, offsets)
+        assert estimate is not None
+        worst = max(worst, float(np.abs(run.unwrapped_error(estimate)).max()))
+        if after == inf and list(run.estimator.sensor_faults()) == [LINK_NAMES[wrong]]:
+            after = n * PERIOD_NS * 1e-9
+    return after, worst
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('degrees', [0.3, -0.5])
+@pytest.mark.parametrize('wrong', range(4))
+def test_small_step_of_a_sensor_is_blamed_on_it(
+    wrong: int, degrees: float, seed: int, mechanism: Mechanism,
+) -> None:
+    """Not on its partner, and the estimate does without it: 0.3 deg are three sigmas."""
+    run = Run(mechanism, InitialState(0.3, 1.6, 'open', 0.3, -0.2), seed=seed)
+    run.after(500)
+    assert run.estimator.sensor_faults() == {}
+    after, worst = named(run, 500, np.radians(degrees) * np.eye(4)[wrong], wrong)
+    assert after < 2.0, f'seed {seed}'
+    assert worst < np.radians(0.3), f'seed {seed}'
+    assert list(run.estimator.sensor_faults()) == [LINK_NAMES[wrong]]
+    # It is used again when it is right again.
+    run.after(250)
+    assert run.estimator.sensor_faults() == {}
+    (estimate,) = run.ticks(1)
+    assert estimate.innovation is not None and estimate.innovation.degrees_of_freedom == 4
+
+
+def test_pair_is_named_where_one_cannot_be_told_from_its_partner(paper: Mechanism) -> None:
+    """
+    Opposite links that were off by the same from the start, one up and one down.
+
+    Nothing tells which of the two is right: the filter never saw another thing.
+    """
+    run = Run(paper, InitialState(0.3, 1.6))
+    for _ in range(1000):
+        run.tick(None, None, np.radians(0.1) * np.array([1.0, 0.0, -1.0, 0.0]))
+    faults = run.estimator.sensor_faults()
+    assert set(faults) == {'link_a', 'link_c'}
+    assert faults['link_a'].endswith('or link_c is')
+    # Both are used on: the mean of the two is the best that there is.
+    (estimate,) = run.ticks(1)
+    assert estimate.innovation is not None and estimate.innovation.degrees_of_freedom == 4
+
+
+def test_sensor_that_nothing_can_replace_is_named_and_used(paper: Mechanism) -> None:
+    """The heading beside joint encoders: without it nobody knows where the whole points."""
+    run = Run(paper, InitialState(0.3, 1.6), joint_encoders('link_a'))
+    run.after(500)
+    offsets = np.radians(0.3) * np.eye(5)[4]
+    seen = set()
+    for _ in range(250):
+        estimate = run.tick(None, None, offsets)
+        assert estimate is not None
+        seen.update(run.estimator.sensor_faults())
+    assert seen == {'link_a'}
+    assert estimate.innovation is not None and estimate.innovation.degrees_of_freedom == 5
+
+
+# Gyros
+
+GYROS = replace(REAL, link_sensors=replace(
+    REAL.link_sensors, gyro=True, gyro_noise_rms=5e-3, gyro_bias=(0.05, -0.03, 0.0, 0.1)))
+
+
+def test_biases_of_gyros_are_found(mechanism: Mechanism) -> None:
+    run = Run(mechanism, InitialState(0.3, 1.6, 'open', 0.5, -0.3), GYROS)
+    estimate = run.after(1000)
+    assert list(estimate.gyro_biases) == [0, 1, 2, 3]
+    # A thousand samples of 5 mrad/s each, and a rate that is known as well.
+    np.testing.assert_allclose(
+        list(estimate.gyro_biases.values()), [0.05, -0.03, 0.0, 0.1], rtol=0.0, atol=2e-3)
+    assert (np.abs(run.error(estimate)[4:]) < SIGMAS * estimate.rate_sigmas).all()
+
+
+def test_gyros_make_the_rate_known_sooner(paper: Mechanism) -> None:
+    """With biases that are known by then, after something hit the linkage."""
+    sigmas = []
+    for table in (REAL, GYROS):
+        run = Run(paper, InitialState(0.3, 1.6), table)
+        run.estimator = Estimator(paper, EstimatorSettings(disturbance_torque=1e-5))
+        sigmas.append(run.after(500).rate_sigmas[0])
+    assert sigmas[1] < 0.5 * sigmas[0]
+
+
+def test_gyro_that_is_not_finite_is_rejected_with_its_message(running: Run) -> None:
+    with pytest.raises(RejectedError) as caught:
+        running.estimator.measure(
+            running.stamp_ns + 1, list(LINK_NAMES), [0.0] * 4, [0.0, nan, 0.0, 0.0])
+    assert caught.value.kind == 'finite'
+
+
+# Wheels that are not measured
+
+@pytest.mark.parametrize('way', ['wheel efforts', 'commanded efforts'])
+def test_without_speeds_the_efforts_drive_it(way: str, paper: Mechanism) -> None:
+    """Said, and less sure of the rates, but through a motion that it would lose without them."""
+    table = replace(REAL, wheel_encoders=WheelEncoders(0))
+    run = Run(paper, InitialState(0.3, 1.6), table)
+    sure = run.after(500).rate_sigmas
+    worst = 0.0
+    for n in range(250):
+        torques = 5e-5 * np.sin(0.1 * n + np.arange(4))
+        run.plant.advance(8, torques)
+        run.stamp_ns += PERIOD_NS
+        run.plant.measure_links(run.stamp_ns)
+        reading, = run.plant.link_sensors.due(run.stamp_ns)
+        run.estimator.measure(run.stamp_ns, LINK_NAMES, list(reading.angles))
+        efforts = run.plant.efforts.copy()
+        if way == 'commanded efforts':
+            run.estimator.commanded(list(efforts))
+            efforts = np.empty(0)
+        estimate = run.estimator.tick(run.stamp_ns, [], list(efforts))
+        assert estimate is not None
+        assert run.estimator.driven_by == way
+        worst = max(worst, float(np.abs(run.error(estimate)[4:]).max()))
+    assert (estimate.rate_sigmas > 1.5 * sure).all()
+    # 5e-5 N m move a pair of links by 0.3 rad/s^2, a half turn of the sine by 0.05 rad/s.
+    assert worst < 0.02
+    run.after(2)
+    assert run.estimator.driven_by == 'wheel speeds'
+
+
+def test_without_anything_of_the_wheels_that_is_said(paper: Mechanism) -> None:
+    run = Run(paper, InitialState(0.3, 1.6))
+    run.after(250)
+    estimate = run.estimator.tick(run.stamp_ns + PERIOD_NS, [])
+    assert estimate is not None
+    assert run.estimator.driven_by == 'nothing'
+
+
+@pytest.mark.parametrize('efforts', [[0.0] * 3, [nan, 0.0, 0.0, 0.0], [inf] * 4])
+def test_commands_of_no_use_are_left_alone(efforts: list[float], running: Run) -> None:
+    running.estimator.commanded(efforts)
+    assert running.estimator.tick(running.stamp_ns + PERIOD_NS, []) is not None
+    assert running.estimator.driven_by == 'nothing'
+
+
+# Disturbances
+
+def test_constant_torques_are_found(paper: Mechanism) -> None:
+    """On link c it is one on its partner a."""
+    run = Run(paper, InitialState(0.3, 1.6))
+    run.estimator = Estimator(paper, EstimatorSettings(disturbance_walk=3e-7))
+    given = np.array([2e-6, -1e-6, 1e-6, 0.0])
+    run.plant._around['link_torques'] = given
+    run.plant._around['acting'] = True
+    estimate = run.after(1500)
+    error = estimate.disturbance - [3e-6, -1e-6]
+    assert (np.abs(error) < SIGMAS * estimate.disturbance_sigmas).all()
+    assert (estimate.disturbance_sigmas < 1e-6).all()
+
+
+# Decisions
+
+def test_every_sensor_has_its_decision_at_every_tick(running: Run) -> None:
+    """Accepted, gated, late, not finite, no data; by name, with the square of the innovation."""
+    def decided(estimate: Estimate | None) -> dict[str, str]:
+        assert estimate is not None
+        return {LINK_NAMES[decision.sensor]: DECISIONS[decision.reason]
+                for decision in estimate.decisions}
+    everybody = dict.fromkeys(LINK_NAMES, 'accepted')
+    (estimate,) = running.ticks(1)
+    assert decided(estimate) == everybody
+    assert decided(running.tick((0, 2))) == {
+        **everybody, 'link_b': 'no data', 'link_d': 'no data'}
+    far_off = running.tick(None, None, 0.5 * np.eye(4)[3])
+    assert decided(far_off) == {**everybody, 'link_d': 'gated'}
+    assert far_off is not None and far_off.decisions[3].square > EstimatorSettings().gate
+    for stamp_ns, angle, reason in ((running.stamp_ns - 200_000_000, 0.3, 'late'),
+                                    (running.stamp_ns + 1, nan, 'not finite')):
+        with pytest.raises(RejectedError):
+            running.estimator.measure(stamp_ns, ['link_b'], [angle])
+        assert decided(running.tick((0, 2, 3))) == {**everybody, 'link_b': reason}
+
+
+def test_measurements_of_the_future_are_counted(running: Run) -> None:
+    running.estimator.measure(running.stamp_ns + 20_000_000_000, ['link_b'], [0.3])
+    running.after(1)
+    assert running.estimator.rejected == Counter(future=1)
+    assert 'after the tick' in running.estimator.last_rejection
+
+
+@pytest.mark.parametrize(('lag', 'fault'), [(12, 'samples come late'),
+                                            (40, 'samples come too late')])
+def test_sensor_that_lags_behind_the_others_is_named(lag: int, fault: str, paper: Mechanism
+                                                     ) -> None:
+    """Its samples are used at their stamps as long as they can be."""
+    run = Run(paper, InitialState(0.3, 1.6, 'open', 0.5, -0.3))
+    run.after(250)
+    late: list[tuple[int, float]] = []
+    for _ in range(100):
+        estimate = run.tick((0, 1, 2))
+        late.append((run.stamp_ns, float(run.plant.truth().link_angles[3])))
+        if len(late) > lag:
+            stamp_ns, angle = late.pop(0)
+            with suppress(RejectedError):
+                run.estimator.measure(stamp_ns, ['link_d'], [angle])
+    assert run.estimator.sensor_faults() == {'link_d': fault}
+    assert estimate is not None
+    assert np.abs(run.unwrapped_error(estimate)).max() < SIGMAS * NOISE / 3.0
