@@ -1,0 +1,157 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The estimator behind its topics: messages in, messages out, whoever carries them.
+
+The node hands over what the middleware brings, the replay of a bag what a recorder kept. Both get
+the same answers, so a replay with the settings of the node says what the node said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from fourbar_ros.estimation.estimator import (
+    Estimate,
+    Estimator,
+    EstimatorSettings,
+    STATE_NAMES,
+)
+from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism, SENSOR_NAMES
+from fourbar_ros.mechanism.by_name import RejectedError
+from fourbar_ros.mechanism.constants import Array
+import numpy as np
+
+# The upper triangle, row by row.
+COVARIANCES = tuple(
+    f'{row}.{column}' for n, row in enumerate(STATE_NAMES) for column in STATE_NAMES[n:])
+UPPER = np.triu_indices(len(STATE_NAMES))
+
+MEASURED, TICK = 'link_angles', 'flywheel_states'
+INPUTS = (MEASURED, TICK)
+"""Topics that the estimator subscribes to, all JointState."""
+
+
+class Output(NamedTuple):
+    """
+    A JointState topic that the estimator publishes.
+
+    :param names: in their order; a message may leave some out, or carry others.
+    :param fields: those of position, velocity, effort that are used.
+    :param frame: in which orientations are given, or ''.
+    """
+
+    names: tuple[str, ...]
+    fields: tuple[str, ...] = ('position', 'velocity')
+    frame: str = ''
+
+
+STATES, INNOVATION = 'estimate/link_states', 'estimate/innovation'
+OUTPUTS = {
+    STATES: Output(LINK_NAMES, frame='table'),
+    'estimate/sigma': Output(LINK_NAMES),
+    'estimate/covariance': Output(COVARIANCES, ('position',)),
+    INNOVATION: Output(('nis', 'degrees_of_freedom', *LINK_NAMES), ('position',)),
+}
+WAITING = 'estimate/waiting'
+"""The topic, of type Header, that answers a tick for which there is no estimate."""
+
+
+class Message(NamedTuple):
+    """
+    What is to be published.
+
+    :param topic: of `OUTPUTS`, or `WAITING`, which has a stamp and nothing else.
+    :param stamp_ns: of the header [ns].
+    :param names: k of them.
+    :param values: an array (k,) for each of the topic's fields.
+    """
+
+    topic: str
+    stamp_ns: int
+    names: tuple[str, ...] = ()
+    values: tuple[Array, ...] = ()
+
+
+class Answer(NamedTuple):
+    """
+    What a message led to.
+
+    :param messages: to be published in this order.
+    :param rejection: why the message was not used, or ''.
+    """
+
+    messages: tuple[Message, ...] = ()
+    rejection: str = ''
+
+
+class EstimatorTopics:
+    """
+    Hands messages to an estimator, and gives what it has to say.
+
+    :ivar estimator: the one that they are handed to.
+    """
+
+    def __init__(self, mechanism: Mechanism, settings: EstimatorSettings) -> None:
+        self.estimator = Estimator(mechanism, settings)
+        self._last: tuple[int, Answer] | None = None
+
+    def receive(self, topic: str, stamp_ns: int, names: Sequence[str], position: Sequence[float],
+                velocity: Sequence[float], effort: Sequence[float]) -> Answer:
+        """
+        Take a message; one that is of no use is counted, and changes nothing.
+
+        :param topic: one of `INPUTS`.
+        :param stamp_ns: of the header [ns].
+        :param names, position, velocity, effort: as they are in the message.
+        """
+        if topic == TICK:
+            return self._tick(stamp_ns, names, velocity)
+        try:
+            self.estimator.measure(stamp_ns, names, position)
+        except RejectedError as error:
+            return Answer(rejection=str(error))
+        return Answer()
+
+    def _tick(self, stamp_ns: int, names: Sequence[str], velocity: Sequence[float]) -> Answer:
+        if self._last is not None and self._last[0] == stamp_ns:
+            # A lock-step sends a tick again when its answer was lost.
+            return self._last[1]
+        try:
+            estimate = self.estimator.tick(
+                stamp_ns, velocity if tuple(names) == FLYWHEEL_NAMES else ())
+        except RejectedError as error:
+            return Answer((Message(WAITING, stamp_ns),), str(error))
+        answer = Answer(messages_of(stamp_ns, estimate))
+        self._last = stamp_ns, answer
+        return answer
+
+
+def messages_of(stamp_ns: int, estimate: Estimate | None) -> tuple[Message, ...]:
+    """Say what the estimate of a tick is, or that there is none: either answers a lock-step."""
+    if estimate is None:
+        return (Message(WAITING, stamp_ns),)
+    messages = (
+        Message(STATES, stamp_ns, LINK_NAMES, (estimate.link_angles, estimate.link_rates)),
+        Message('estimate/sigma', stamp_ns, LINK_NAMES,
+                (estimate.angle_sigmas, estimate.rate_sigmas)),
+        Message('estimate/covariance', stamp_ns, COVARIANCES, (estimate.covariance[UPPER],)),
+    )
+    if (seen := estimate.innovation) is None:
+        return messages
+    names = ('nis', 'degrees_of_freedom', *(SENSOR_NAMES[sensor] for sensor in seen.sensors))
+    return (*messages, Message(INNOVATION, stamp_ns, names, (
+        np.array([seen.nis, seen.degrees_of_freedom, *seen.angles]),)))
