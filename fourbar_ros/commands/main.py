@@ -50,6 +50,7 @@ COMMANDS = {
     'status': 'show device and controller',
     'record': 'write topics to a rosbag2 directory',
     'report': 'turn a bag into an HTML report and metrics',
+    'replay': 'the estimator over a bag, with other settings',
     'demo': 'the whole loop, from start to report',
     'simulate': 'integrate one motion, without ROS',
     'bench': 'time the mechanics beside MuJoCo',
