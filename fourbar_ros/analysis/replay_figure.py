@@ -88,9 +88,9 @@ def _error(axes: Axes, comparison: Comparison, replayed: Difference, kind: str, 
     recorded = comparison.recorded_minus_truth
     shown = [replayed] if recorded is None else [recorded, replayed]
     if recorded is not None:
-        axes.plot(*_curve(comparison, recorded, kind, link), label='recorded \u2212 ground truth',
+        axes.plot(*_curve(comparison, recorded, kind, link), label='recorded \u2212 truth',
                   **RECORDED)
-    axes.plot(*_curve(comparison, replayed, kind, link), label='replayed \u2212 ground truth',
+    axes.plot(*_curve(comparison, replayed, kind, link), label='replayed \u2212 truth',
               color=LINK_COLOURS[link], linewidth=1.2)
     _centre(axes, max(_reach(comparison, each, kind) for each in shown))
     axes.set_title(f'link {LETTERS[link]}', color=LINK_COLOURS[link], fontweight='bold')
