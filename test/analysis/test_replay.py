@@ -15,6 +15,7 @@
 """A replay says what the estimator would have said, and how far that is from what it did say."""
 
 from dataclasses import asdict
+import sqlite3
 
 from fourbar_ros.analysis.bags import BagError, read_bag
 from fourbar_ros.analysis.replay import replay, ReplayError
@@ -129,8 +130,6 @@ def test_single_file_is_enough(synthetic, loop_messages, same, tmp_path, storage
 
 def test_bag_of_an_older_recorder(synthetic, loop_messages, same, tmp_path):
     """SQLite before Iron: no definitions, no hashes, another metadata version."""
-    import sqlite3
-
     from ruamel.yaml import YAML
     bag = synthetic.write_bag(tmp_path / 'bag', loop_messages, StoragePlugin.SQLITE3, version=8)
     with sqlite3.connect(bag / 'bag.db3') as base:
@@ -417,3 +416,12 @@ def test_bag_cut_anywhere_is_refused(loop_bag, tmp_path):
     for share in (0.0, 0.01, 0.5, 0.999):
         file.write_bytes(content[:int(share * len(content))])
         complaint(file, tmp_path)
+
+
+def test_bag_that_lost_messages_is_refused(synthetic, loop_messages, tmp_path):
+    """Its metadata tells of more."""
+    bag = synthetic.write_bag(tmp_path / 'bag', loop_messages, StoragePlugin.SQLITE3)
+    with sqlite3.connect(bag / 'bag.db3') as base:
+        base.execute('DELETE FROM messages WHERE id > 1500')
+    with pytest.raises(BagError, match=r'is cut: 1500 of \d+ messages are left'):
+        replay(bag, tmp_path / 'new', OWN)
