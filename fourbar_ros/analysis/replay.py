@@ -175,7 +175,7 @@ def replay(bag: str | Path, output: Path, values: Mapping[str, Any], *,
     Run the estimator over a bag, and write a new one (MCAP).
 
     It holds all that the old one does, with the estimates in place of those that were recorded,
-    at the log times of the ticks that they answer.
+    at the log times of the ticks that they answer. After an error a part of it may be there.
 
     :param bag: rosbag2 directory, or its single file.
     :param output: directory to make.
