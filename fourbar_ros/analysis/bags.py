@@ -200,7 +200,7 @@ def read_bag(path: str | Path, namespace: str | None = None,
     :raises BagError: missing, no bag, not closed by its recorder, cut, or damaged.
     """
     path = Path(path)
-    _check_directory(path)
+    check_directory(path)
     try:
         return _read(path, namespace, progress)
     except BagError:
@@ -210,7 +210,12 @@ def read_bag(path: str | Path, namespace: str | None = None,
         raise BagError(f'{path} is cut or damaged: {reason}') from error
 
 
-def _check_directory(path: Path) -> None:
+def check_directory(path: Path) -> None:
+    """
+    Refuse what is no rosbag2 directory.
+
+    :raises BagError: missing, a file, or without metadata.
+    """
     if not path.exists():
         raise BagError(f'{path}: no such directory')
     if not path.is_dir():

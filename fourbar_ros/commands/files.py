@@ -57,6 +57,41 @@ def write_whole(path: Path) -> Iterator[TextIO]:
         raise
 
 
+def check_new_folder(folder: Path) -> None:
+    """
+    Refuse a folder that exists or cannot be made.
+
+    :raises OutputError: with what stands in the way.
+    """
+    if folder.exists():
+        raise OutputError(f'{folder} exists already: choose another name or remove it')
+    parent = next(above for above in folder.absolute().parents if above.exists())
+    if not parent.is_dir():
+        raise OutputError(f'cannot make {folder}: {parent} is not a directory')
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise OutputError(f'cannot make {folder}: {parent} is not writable')
+
+
+@contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """
+    Make a folder that appears under its name only once it is complete.
+
+    :returns: where to make it: a path of the same name, with nothing there.
+    :raises OutputError: it exists already, cannot be made, or the disk is full.
+    """
+    check_new_folder(folder)
+    parent = folder.absolute().parent
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=parent, prefix=f'.{folder.name}.') as temporary:
+            made = Path(temporary) / folder.name
+            yield made
+            os.rename(made, folder)
+    except OSError as error:
+        raise OutputError(f'cannot write {folder}: {error.strerror or error}') from None
+
+
 def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)

@@ -50,6 +50,7 @@ COMMANDS = {
     'status': 'show device and controller',
     'record': 'write topics to a rosbag2 directory',
     'report': 'turn a bag into an HTML report and metrics',
+    'replay': 'the estimator over a bag, with other settings',
     'demo': 'the whole loop, from start to report',
     'simulate': 'integrate one motion, without ROS',
     'bench': 'time the mechanics beside MuJoCo',
@@ -101,18 +102,19 @@ def _module(command: str) -> ModuleType:
 
 
 def _parser(name: str) -> argparse.ArgumentParser:
-    """Make the parser; only the named command brings its own arguments (all when completing)."""
+    """Make the parser; only the named command brings its own arguments, which may take long."""
     parser = argparse.ArgumentParser(
         prog='fourbar', description='A free-floating four-bar linkage: simulate, estimate, '
         'control, drive and look at it over ROS 2 topics.')
     parser.add_argument('--version', action='version', version=f'fourbar_ros {__version__}')
     subparsers = parser.add_subparsers(dest='command', metavar='COMMAND', title='commands')
     completing = '_ARGCOMPLETE' in os.environ
+    named = os.environ.get('COMP_LINE', '').split() if completing else [name]
     for command, text in COMMANDS.items():
         subparser = subparsers.add_parser(
             command, help=text, description=f'{text[0].upper()}{text[1:]}.',
             formatter_class=argparse.RawDescriptionHelpFormatter)
-        if command not in NODES and (completing or command == name):
+        if command not in NODES and command in named:
             _module(command).add_arguments(subparser)
     if completing:
         import argcomplete

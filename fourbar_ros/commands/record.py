@@ -15,11 +15,11 @@
 """Record topics into a rosbag2 directory, without ``ros2 bag``."""
 
 import argparse
-import os
 from pathlib import Path
 import sys
 import time
 
+from fourbar_ros.commands.files import check_new_folder
 from fourbar_ros.commands.ros import add_ros_arguments
 from fourbar_ros.errors import FourbarError
 
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Record until SIGINT or SIGTERM; say how much."""
     directory = Path(args.output or time.strftime('rosbag2_%Y_%m_%d-%H_%M_%S'))
-    check_output(directory)
+    check_new_folder(directory)
     from fourbar_ros.nodes.environment import check_environment
     check_environment()
     try:
@@ -54,18 +54,3 @@ def run(args: argparse.Namespace) -> int:
         ros_args=args.ros_args, live=sys.stdout.isatty())
     print(f'{sum(counts.values())} messages of {len(counts)} topics in {directory}', flush=True)
     return 0
-
-
-def check_output(directory: Path) -> None:
-    """
-    Refuse a directory that exists or cannot be made.
-
-    :raises FourbarError: with what stands in the way.
-    """
-    if directory.exists():
-        raise FourbarError(f'{directory} exists already: choose another name or remove it')
-    parent = next(folder for folder in directory.absolute().parents if folder.exists())
-    if not parent.is_dir():
-        raise FourbarError(f'cannot make {directory}: {parent} is not a directory')
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise FourbarError(f'cannot make {directory}: {parent} is not writable')

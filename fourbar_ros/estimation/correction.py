@@ -28,6 +28,10 @@ from numpy.typing import NDArray
 # What became of a sample.
 USED, REFUSED, LEFT_OUT = 0, 1, 2
 
+# From so many times the gate on, as the square of the innovation, a sample is too far off to be
+# let in by noise.
+BEYOND = 4.0
+
 
 @kernel
 def correct(x: Array, covariance: Array, suspicions: Array, sensors: NDArray[np.int64],
@@ -154,13 +158,14 @@ def _weigh_refused(suspicions: Array, sensors: NDArray[np.int64], rows: Array, y
     """
     Weigh suspicions by all samples but those left out, though only some moved the filter.
 
-    What the gate refuses speaks of its sensor, too, but one sample, wherever it lies, as loudly
-    as one at the gate.
+    What the gate refuses speaks of its sensor, too, but as loudly as a sample at the gate. What
+    is so far off that the gate will always refuse it does not: it does no harm, and is of use as
+    soon as it agrees again.
 
     :param covariance: before the correction.
     :param gain: of the samples that were used.
     """
-    heard = np.flatnonzero(fate != LEFT_OUT)
+    heard = np.flatnonzero((fate == USED) | (fate == REFUSED) & (squares < BEYOND * gate))
     many, size = heard.size, rows.shape[1]
     h, innovation, full = rows[heard], y[heard], np.zeros((size, many))
     s = h @ covariance @ h.T

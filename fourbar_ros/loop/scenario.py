@@ -32,6 +32,7 @@ from fourbar_ros.control import ControllerSettings
 from fourbar_ros.device.testbed import TIMEOUT_ACTIONS
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.estimation import EstimatorSettings
+from fourbar_ros.estimation.parameters import SETTINGS
 from fourbar_ros.mechanism import assemble, LINK_NAMES, load_mechanism, Mechanism
 from fourbar_ros.mechanism.closure import BRANCHES
 from fourbar_ros.mechanism.constants import Array
@@ -155,10 +156,7 @@ ALLOWED: dict[str, dict[str, Allowed]] = {
         'command_timeout': (0.002, 10.0, 's'), 'sensor_timeout': (0.002, 10.0, 's'),
         'timeout_action': TIMEOUT_ACTIONS},
     'estimator': {
-        'angle_noise': (1e-9, 1.0, 'rad'), 'counts_per_turn': (0, 2 ** 31, ''),
-        'gyro_noise': (1e-9, 100.0, 'rad/s'), 'gyro_walk': (0.0, 10.0, 'rad/s/sqrt(s)'),
-        'disturbance_torque': (0.0, 10.0, 'N m/sqrt(Hz)'),
-        'disturbance_walk': (0.0, 10.0, 'N m/sqrt(s)'), 'gate_probability': (0.9, 1.0, '')},
+        row.name: (*row.limits, row.unit) for row in SETTINGS if row.limits is not None},
     'controller': {
         'bandwidth': (0.1, 20.0, 'rad/s'), 'damping': (0.1, 2.0, ''),
         'setpoint_duration': (0.1, 3600.0, 's')},

@@ -21,11 +21,12 @@ The parameter tables of all nodes, and the files made from them.
 
 import sys
 
-from fourbar_ros.nodes import controller, estimator, plant
+from fourbar_ros.estimation.parameters import PARAMETERS as ESTIMATOR_PARAMETERS
+from fourbar_ros.nodes import controller, plant
 
 TABLES = {
     'plant': plant.PARAMETERS,
-    'estimator': estimator.PARAMETERS,
+    'estimator': ESTIMATOR_PARAMETERS,
     'controller': controller.PARAMETERS,
 }
 

@@ -14,9 +14,11 @@
 
 """The bags of known motions, for the tests of this folder."""
 
+from dataclasses import replace
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
+from fourbar_ros.loop import load_scenario
 import pytest
 
 
@@ -34,3 +36,15 @@ def motion_bag(synthetic, tmp_path_factory):
     """Return the bag of the whole motion at 50 Hz."""
     return synthetic.write_bag(
         tmp_path_factory.mktemp('motion') / 'bag', synthetic.motion_messages())
+
+
+@pytest.fixture(scope='session')
+def loop_messages(synthetic):
+    """Return what the nodes publish on a table with late and lossy sensors."""
+    return synthetic.closed_loop_messages(replace(load_scenario('prototype'), duration=1.6))
+
+
+@pytest.fixture(scope='session')
+def loop_bag(synthetic, loop_messages, tmp_path_factory):
+    """Return the bag of it."""
+    return synthetic.write_bag(tmp_path_factory.mktemp('loop') / 'bag', loop_messages)

@@ -20,12 +20,15 @@ truth, estimate and wheels differ from it by sines with whole periods in the ste
 mean squares are amplitude / sqrt(2) and nothing else.
 """
 
+from fourbar_ros.loop import run_scenario
+from fourbar_ros.mechanism import SENSOR_NAMES
 import numpy as np
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
 LINKS = ('link_a', 'link_b', 'link_c', 'link_d')
 WHEELS = ('flywheel_a', 'flywheel_b', 'flywheel_c', 'flywheel_d')
+STATES = ('phi_a', 'phi_b', 'omega_a', 'omega_b')
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -60,9 +63,12 @@ def status(**values):
     return STORE.types[STATUS](level=0, name='', message='', hardware_id='', values=pairs)
 
 
-def write_bag(path, messages, storage=StoragePlugin.MCAP):
+def write_bag(path, messages, storage=StoragePlugin.MCAP, version=9, compression=None):
     """Write {topic: [(received_ns, message), ...]}; an empty list makes an empty topic."""
-    with Writer(path, version=9, storage_plugin=storage) as writer:
+    writer = Writer(path, version=version, storage_plugin=storage)
+    if compression is not None:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
         connections = {}
         for topic, entries in messages.items():
             message_type = entries[0][1].__msgtype__ if entries else JOINT_STATE
@@ -165,3 +171,45 @@ def timing(stamp, row, rng):
     if row % 100 == 99:
         del names[:2], values[:2]
     return joint_state(stamp, names, values)
+
+
+def closed_loop_messages(scenario, namespace=''):
+    """
+    Return what the nodes would publish in a run, as a recorder would get it.
+
+    Nothing here goes through the code that decides what the estimator publishes.
+    """
+    topics = {}
+    now = RECORDER_OFFSET_NS
+
+    def add(name, message):
+        nonlocal now
+        now += 10_000
+        topics.setdefault(f'{namespace}/{name}', []).append((now, message))
+
+    add('device_status', status(state='disarmed', mechanism=scenario.mechanism_name))
+    for step in run_scenario(scenario):
+        stamp = step.samples.stamp_ns
+        for sample in step.samples.links:
+            add('link_angles', joint_state(
+                sample.stamp_ns, sample.names, sample.angles, sample.rates))
+        wheels, truth = step.samples.wheels, step.samples.truth
+        add('flywheel_states', joint_state(
+            stamp, WHEELS, wheels.angles, wheels.speeds, wheels.efforts))
+        add('sim/link_states', joint_state(stamp, LINKS, truth.link_angles, truth.link_rates))
+        if (estimate := step.estimate) is None:
+            continue
+        add('estimate/link_states', joint_state(
+            stamp, LINKS, estimate.link_angles, estimate.link_rates))
+        add('estimate/sigma', joint_state(
+            stamp, LINKS, estimate.angle_sigmas, estimate.rate_sigmas))
+        count = len(estimate.covariance)
+        add('estimate/covariance', joint_state(
+            stamp, [f'{row}.{column}' for n, row in enumerate(STATES) for column in STATES[n:]],
+            [estimate.covariance[m, n] for m in range(count) for n in range(m, count)]))
+        if (seen := estimate.innovation) is not None:
+            add('estimate/innovation', joint_state(
+                stamp, ['nis', 'degrees_of_freedom',
+                        *(SENSOR_NAMES[sensor] for sensor in seen.sensors)],
+                [seen.nis, np.sum(seen.used), *seen.angles]))
+    return topics

@@ -20,7 +20,7 @@ import stat
 import tempfile
 from typing import Any
 
-from fourbar_ros.commands.files import OutputError, write_whole
+from fourbar_ros.commands.files import OutputError, whole_folder, write_whole
 import pytest
 
 
@@ -124,4 +124,33 @@ def test_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(OutputError, match='No space left'), write_whole(
             tmp_path / 'out.csv') as file:
         file.write('text' * 100_000)
+    assert not os.listdir(tmp_path)
+
+
+def test_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
+    folder = tmp_path / 'new' / 'out'
+    with whole_folder(folder) as made:
+        assert made.name == 'out'
+        assert not made.exists()
+        made.mkdir()
+        (made / 'file').write_text('content')
+        assert not folder.exists()
+    assert (folder / 'file').read_text() == 'content'
+    assert os.listdir(tmp_path / 'new') == ['out']
+
+
+@pytest.mark.parametrize('error', [GoneWrongError, KeyboardInterrupt])
+def test_failure_leaves_no_folder_behind(tmp_path: Path, error: type[BaseException]) -> None:
+    with pytest.raises(error), whole_folder(tmp_path / 'out') as made:
+        made.mkdir()
+        (made / 'file').write_text('half')
+        raise error
+    assert not os.listdir(tmp_path)
+
+
+def test_folder_that_is_there_is_kept(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match='exists already'), whole_folder(tmp_path):
+        pass
+    with pytest.raises(OutputError, match='No space'), whole_folder(tmp_path / 'out'):
+        raise OSError(28, 'No space left on device')
     assert not os.listdir(tmp_path)

@@ -1,0 +1,48 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The parameters of the estimator: for its node, for scenarios and for the replay of a bag."""
+
+from __future__ import annotations
+
+from fourbar_ros.estimation.settings import EstimatorSettings
+from fourbar_ros.parameters import Parameter
+
+_DEFAULTS = EstimatorSettings()
+
+SETTINGS = (
+    Parameter('angle_noise', _DEFAULTS.angle_noise, 'rad',
+              'standard deviation of a link-angle sample', limits=(1e-9, 1.0)),
+    Parameter('counts_per_turn', _DEFAULTS.counts_per_turn, '',
+              'resolution of the link-angle sensors, 0 for none', limits=(0, 2 ** 31)),
+    Parameter('gyro_noise', _DEFAULTS.gyro_noise, 'rad/s',
+              'standard deviation of a gyro sample, where gyros are fitted', limits=(1e-9, 100.0)),
+    Parameter('gyro_walk', _DEFAULTS.gyro_walk, 'rad/s/sqrt(s)',
+              'density of the random walk of the bias of a gyro', limits=(0.0, 10.0)),
+    Parameter('disturbance_torque', _DEFAULTS.disturbance_torque, 'N m/sqrt(Hz)',
+              'density of unknown torques on each link', limits=(0.0, 10.0)),
+    Parameter('disturbance_walk', _DEFAULTS.disturbance_walk, 'N m/sqrt(s)',
+              'density of the random walk of the torques that stand for friction and drag',
+              limits=(0.0, 10.0)),
+    Parameter('gate_probability', _DEFAULTS.gate_probability, '',
+              'share of the samples of a healthy sensor that is used, 1 for no gate',
+              limits=(0.9, 1.0)),
+)
+"""The fields of `EstimatorSettings`."""
+
+PARAMETERS = (
+    Parameter('mechanism', 'paper', '', 'preset or path of a mechanism file'),
+    *SETTINGS,
+)
+"""All parameters of the node."""

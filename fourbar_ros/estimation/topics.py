@@ -1,0 +1,188 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The estimator behind its topics: messages in, messages out, whoever carries them.
+
+The node hands over what the middleware brings, the replay of a bag what a recorder kept. Both get
+the same answers, so a replay with the settings of the node says what the node said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from fourbar_ros.estimation.estimate import ACCEPTED, Estimate
+from fourbar_ros.estimation.estimator import BY_COMMAND, BY_NOTHING, Estimator, STATE_NAMES
+from fourbar_ros.estimation.filter import GYROS
+from fourbar_ros.estimation.settings import EstimatorSettings
+from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism, SENSOR_NAMES
+from fourbar_ros.mechanism.by_name import RejectedError
+from fourbar_ros.mechanism.constants import Array
+import numpy as np
+
+# The upper triangle, row by row.
+COVARIANCES = tuple(
+    f'{row}.{column}' for n, row in enumerate(STATE_NAMES) for column in STATE_NAMES[n:])
+# The disturbance torques and one standard deviation of each [N m].
+DISTURBANCES = ('torque_a', 'torque_b', 'sigma_a', 'sigma_b')
+UPPER = np.triu_indices(len(STATE_NAMES))
+
+MEASURED, TICK, COMMAND = 'link_angles', 'flywheel_states', 'flywheel_command'
+INPUTS = (MEASURED, TICK)
+"""Topics that the estimator subscribes to, all JointState; to COMMAND only where it must."""
+
+
+class Output(NamedTuple):
+    """
+    A JointState topic that the estimator publishes.
+
+    :param names: in their order; a message may leave some out, or carry others.
+    :param fields: those of position, velocity, effort that are used.
+    :param frame: in which orientations are given, or ''.
+    """
+
+    names: tuple[str, ...]
+    fields: tuple[str, ...] = ('position', 'velocity')
+    frame: str = ''
+
+
+STATES, INNOVATION = 'estimate/link_states', 'estimate/innovation'
+OUTPUTS = {
+    STATES: Output(LINK_NAMES, frame='table'),
+    'estimate/sigma': Output(LINK_NAMES),
+    'estimate/covariance': Output(COVARIANCES, ('position',)),
+    'estimate/disturbance': Output(DISTURBANCES, ('position',)),
+    'estimate/gyro_bias': Output(LINK_NAMES, ('velocity',)),
+    'estimate/decisions': Output(LINK_NAMES, ('position', 'velocity', 'effort')),
+    INNOVATION: Output(('nis', 'degrees_of_freedom', *LINK_NAMES), ('position',)),
+}
+WAITING = 'estimate/waiting'
+"""The topic, of type Header, that answers a tick for which there is no estimate."""
+
+
+class Message(NamedTuple):
+    """
+    What is to be published.
+
+    :param topic: of `OUTPUTS`, or `WAITING`, which has a stamp and nothing else.
+    :param stamp_ns: of the header [ns].
+    :param names: k of them.
+    :param values: an array (k,) for each of the topic's fields.
+    """
+
+    topic: str
+    stamp_ns: int
+    names: tuple[str, ...] = ()
+    values: tuple[Array, ...] = ()
+
+
+class Answer(NamedTuple):
+    """
+    What a message led to.
+
+    :param messages: to be published in this order.
+    :param rejection: why the message was not used, or ''.
+    """
+
+    messages: tuple[Message, ...] = ()
+    rejection: str = ''
+
+
+class EstimatorTopics:
+    """
+    Hands messages to an estimator, and gives what it has to say.
+
+    :ivar estimator: the one that they are handed to.
+    """
+
+    def __init__(self, mechanism: Mechanism, settings: EstimatorSettings) -> None:
+        self.estimator = Estimator(mechanism, settings)
+        self._last: tuple[int, Answer] | None = None
+
+    def receive(self, topic: str, stamp_ns: int, names: Sequence[str], position: Sequence[float],
+                velocity: Sequence[float], effort: Sequence[float]) -> Answer:
+        """
+        Take a message; one that is of no use is counted, and changes nothing.
+
+        :param topic: one of `INPUTS`, or COMMAND.
+        :param stamp_ns: of the header [ns].
+        :param names, position, velocity, effort: as they are in the message.
+        """
+        if topic == TICK:
+            return self._tick(stamp_ns, names, velocity, effort)
+        if topic == COMMAND:
+            if tuple(names) == FLYWHEEL_NAMES:
+                self.estimator.commanded(effort)
+            return Answer()
+        try:
+            self.estimator.measure(stamp_ns, names, position, velocity)
+        except RejectedError as error:
+            return Answer(rejection=str(error))
+        return Answer()
+
+    @property
+    def needs_commands(self) -> bool:
+        """Tell whether ticks say neither what the wheels did nor what drove them."""
+        return self.estimator.driven_by in (BY_COMMAND, BY_NOTHING)
+
+    def _tick(self, stamp_ns: int, names: Sequence[str], velocity: Sequence[float],
+              effort: Sequence[float]) -> Answer:
+        if self._last is not None and self._last[0] == stamp_ns:
+            # A lock-step sends a tick again when its answer was lost.
+            return self._last[1]
+        try:
+            if tuple(names) != FLYWHEEL_NAMES:
+                raise RejectedError('wheels', f'the names must be {", ".join(FLYWHEEL_NAMES)}')
+            estimate = self.estimator.tick(stamp_ns, velocity, effort)
+        except RejectedError as error:
+            return Answer((Message(WAITING, stamp_ns),), str(error))
+        answer = Answer(messages_of(stamp_ns, estimate))
+        self._last = stamp_ns, answer
+        return answer
+
+
+def messages_of(stamp_ns: int, estimate: Estimate | None) -> tuple[Message, ...]:
+    """Say what the estimate of a tick is, or that there is none: either answers a lock-step."""
+    if estimate is None:
+        return (Message(WAITING, stamp_ns),)
+    messages = (
+        Message(STATES, stamp_ns, LINK_NAMES, (estimate.link_angles, estimate.link_rates)),
+        Message('estimate/sigma', stamp_ns, LINK_NAMES,
+                (estimate.angle_sigmas, estimate.rate_sigmas)),
+        Message('estimate/covariance', stamp_ns, COVARIANCES, (estimate.covariance[UPPER],)),
+        Message('estimate/disturbance', stamp_ns, DISTURBANCES, (
+            np.concatenate([estimate.disturbance, estimate.disturbance_sigmas]),)),
+    )
+    if estimate.gyro_biases:
+        names = tuple(SENSOR_NAMES[sensor] for sensor in estimate.gyro_biases)
+        messages += (Message('estimate/gyro_bias', stamp_ns, names, (
+            np.array(list(estimate.gyro_biases.values())),)),)
+    if estimate.decisions:
+        sensors, reasons, squares = zip(*estimate.decisions)
+        accepted = np.array(reasons) == ACCEPTED
+        messages += (Message(
+            'estimate/decisions', stamp_ns, tuple(SENSOR_NAMES[sensor] for sensor in sensors),
+            (np.array(reasons, float), np.array(squares), accepted.astype(float))),)
+    if (seen := estimate.innovation) is not None:
+        names = ('nis', 'degrees_of_freedom', *map(_name, seen.sensors))
+        messages += (Message(INNOVATION, stamp_ns, names, (
+            np.array([seen.nis, seen.degrees_of_freedom, *seen.values]),)),)
+    return messages
+
+
+def _name(sensor: int) -> str:
+    """Return the name of a sensor, or of a gyro."""
+    return SENSOR_NAMES[sensor] if sensor < GYROS else f'gyro_{SENSOR_NAMES[sensor - GYROS]}'

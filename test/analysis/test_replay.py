@@ -1,0 +1,427 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A replay says what the estimator would have said, and how far that is from what it did say."""
+
+from dataclasses import asdict
+import sqlite3
+
+from fourbar_ros.analysis.bags import BagError, read_bag
+from fourbar_ros.analysis.replay import replay, ReplayError
+from fourbar_ros.analysis.replay_comparison import as_json, as_text, compare
+from fourbar_ros.analysis.replay_figure import png
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.loop import load_scenario
+import numpy as np
+import pytest
+from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin, Writer
+
+# With which the run was made.
+OWN = asdict(load_scenario('prototype').estimator)
+LINKS = ('link_a', 'link_b', 'link_c', 'link_d')
+ESTIMATES = ('link_states', 'sigma', 'covariance', 'innovation')
+KINDS = (('angle_rms_rad', 'angle_max_rad'), ('rate_rms_rad_s', 'rate_max_rad_s'))
+
+
+def stored(bag, topics=None):
+    """Return (topic, type, log time, bytes) of all messages, or of some topics."""
+    with Reader(bag) as reader:
+        return [(connection.topic, connection.msgtype, logged, bytes(data))
+                for connection, logged, data in reader.messages()
+                if topics is None or connection.topic in topics]
+
+
+def numbers(bag, replayed_to, **values):
+    """Replay and return the numbers of the comparison."""
+    return as_json(compare(replay(bag, replayed_to, {**OWN, **values}), 0.5))
+
+
+def changed(messages, topic, change):
+    """Return messages with each of one topic changed: change(index, message) may return more."""
+    entries = []
+    for index, (logged, message) in enumerate(messages[topic]):
+        entries += [(logged, new) for new in change(index, message)]
+    return {**messages, topic: entries}
+
+
+@pytest.fixture(scope='module')
+def same(loop_bag, tmp_path_factory):
+    """Return a replay with the settings that the run had, and its bag."""
+    output = tmp_path_factory.mktemp('replay') / 'new'
+    return replay(loop_bag, output, OWN), output
+
+
+# The new bag
+
+def test_same_settings_give_the_same_estimates_bit_for_bit(synthetic, loop_bag, same):
+    topics = [f'/estimate/{name}' for name in ESTIMATES]
+    old, new = ([(topic, synthetic.STORE.deserialize_cdr(data, kind))
+                 for topic, kind, _, data in stored(bag, topics)] for bag in (loop_bag, same[1]))
+    assert len(old) > 1500
+    for (topic, left), (_, right) in zip(old, new, strict=True):
+        assert (topic, left.header.stamp, left.name) == (topic, right.header.stamp, right.name)
+        for field in ('position', 'velocity', 'effort'):
+            assert getattr(left, field).tobytes() == getattr(right, field).tobytes()
+    assert compare(same[0]).identical
+
+
+def test_everything_else_is_copied_as_it_is(loop_bag, same):
+    others = {'/device_status', '/link_angles', '/flywheel_states', '/sim/link_states'}
+    assert stored(loop_bag, others) == stored(same[1], others)
+    assert {topic for topic, *_ in stored(same[1])} <= {
+        *others, *(f'/estimate/{name}' for name in (*ESTIMATES, 'waiting'))}
+
+
+def test_estimates_have_stamp_and_log_time_of_their_ticks(same):
+    ticks = read_bag(same[1]).arrivals('flywheel_states')
+    states = read_bag(same[1]).arrivals('estimate/link_states')
+    assert np.array_equal(ticks.stamp_ns[-len(states):], states.stamp_ns)
+    assert np.array_equal(ticks.received_ns[-len(states):], states.received_ns)
+
+
+def test_ticks_without_estimate_are_told(same):
+    found, bag = same
+    waiting = stored(bag, ['/estimate/waiting'])
+    assert len(waiting) == found.waiting > 0
+    assert {kind for _, kind, _, _ in waiting} == {'std_msgs/msg/Header'}
+
+
+def test_frame_is_that_of_the_node(synthetic, same):
+    _, kind, _, data = stored(same[1], ['/estimate/link_states'])[0]
+    assert synthetic.STORE.deserialize_cdr(data, kind).header.frame_id == 'table'
+
+
+def test_same_bag_and_settings_give_the_same_bytes(loop_bag, tmp_path):
+    values = {**OWN, 'angle_noise': 0.004}
+    for folder in ('one', 'two'):
+        replay(loop_bag, tmp_path / folder / 'new', values)
+    for name in ('new.mcap', 'metadata.yaml'):
+        assert (tmp_path / 'one' / 'new' / name).read_bytes() == (
+            tmp_path / 'two' / 'new' / name).read_bytes()
+
+
+@pytest.mark.parametrize('how', [
+    {'compression': CompressionMode.MESSAGE, 'version': 8},
+    {'compression': CompressionMode.FILE, 'storage': StoragePlugin.SQLITE3}], ids=str)
+def test_storage_makes_no_difference(synthetic, loop_messages, same, tmp_path, how):
+    bag = synthetic.write_bag(tmp_path / 'bag', loop_messages, **how)
+    replay(bag, tmp_path / 'new', OWN)
+    assert stored(tmp_path / 'new') == stored(same[1])
+
+
+@pytest.mark.parametrize('storage', list(StoragePlugin), ids=lambda plugin: plugin.name)
+def test_single_file_is_enough(synthetic, loop_messages, same, tmp_path, storage):
+    bag = synthetic.write_bag(tmp_path / 'bag', loop_messages, storage)
+    file, = [path for path in bag.iterdir() if path.name != 'metadata.yaml']
+    replay(file, tmp_path / 'new', OWN)
+    assert stored(tmp_path / 'new') == stored(same[1])
+
+
+def test_bag_of_an_older_recorder(synthetic, loop_messages, same, tmp_path):
+    """SQLite before Iron: no definitions, no hashes, another metadata version."""
+    from ruamel.yaml import YAML
+    bag = synthetic.write_bag(tmp_path / 'bag', loop_messages, StoragePlugin.SQLITE3, version=8)
+    with sqlite3.connect(bag / 'bag.db3') as base:
+        base.executescript(
+            'DROP TABLE message_definitions; DROP TABLE schema; DROP TABLE metadata;'
+            'ALTER TABLE topics DROP COLUMN type_description_hash;')
+    yaml = YAML(typ='safe')
+    metadata = yaml.load((bag / 'metadata.yaml').read_text())
+    information = metadata['rosbag2_bagfile_information']
+    information['version'] = 5
+    for key in ('custom_data', 'ros_distro'):
+        del information[key]
+    for topic in information['topics_with_message_count']:
+        del topic['topic_metadata']['type_description_hash']
+    with (bag / 'metadata.yaml').open('w') as file:
+        yaml.dump(metadata, file)
+    replay(bag, tmp_path / 'new', OWN)
+    assert stored(tmp_path / 'new') == stored(same[1])
+
+
+def test_messages_of_unknown_types_are_copied_with_their_definitions(
+        synthetic, loop_bag, tmp_path):
+    text, digest = 'uint8 level\n', 'RIHS01_' + 'ab' * 32
+    odd = [('/odd', 'lab_msgs/msg/Odd', text, digest), ('/bare', 'lab_msgs/msg/Bare', '', '')]
+    with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        made = {}
+        for topic, kind, definition, known in odd:
+            made[topic] = writer.add_connection(
+                topic, kind, msgdef=definition, rihs01=known or 'none')
+        for topic, kind, logged, data in stored(loop_bag):
+            if topic not in made:
+                made[topic] = writer.add_connection(topic, kind, typestore=synthetic.STORE)
+            writer.write(made[topic], logged, data)
+            if topic == '/flywheel_states':
+                for other, *_ in odd:
+                    writer.write(made[other], logged, b'\0\1\0\0\7')
+    replay(tmp_path / 'bag', tmp_path / 'new', OWN)
+    topics = {topic for topic, *_ in odd}
+    assert stored(tmp_path / 'bag', topics) == stored(tmp_path / 'new', topics) != []
+    with Reader(tmp_path / 'new') as reader:
+        found = {connection.topic: connection for connection in reader.connections}
+    assert found['/odd'].msgdef.data == text
+    assert found['/odd'].digest == digest
+
+
+# Suites and settings
+
+def test_one_of_two_suites_is_chosen_by_its_namespace(
+        synthetic, loop_messages, same, tmp_path):
+    both = {f'{space}{topic}': entries for space in ('/table1', '/lab/table2')
+            for topic, entries in loop_messages.items()}
+    bag = synthetic.write_bag(tmp_path / 'bag', both)
+    with pytest.raises(BagError, match='/lab/table2, /table1'):
+        replay(bag, tmp_path / 'none', {})
+    with pytest.raises(BagError, match='there are /lab/table2, /table1$'):
+        replay(bag, tmp_path / 'none', {}, namespace='table3')
+    found = replay(bag, tmp_path / 'new', OWN, namespace='table1')
+    assert found.namespace == '/table1'
+    assert compare(found).identical
+    assert [entry[2:] for entry in stored(tmp_path / 'new', ['/table1/estimate/link_states'])] == [
+        entry[2:] for entry in stored(same[1], ['/estimate/link_states'])]
+    other = ['/lab/table2/estimate/link_states', '/lab/table2/link_angles']
+    assert stored(bag, other) == stored(tmp_path / 'new', other)
+
+
+def test_only_suite_is_found_in_its_namespace(synthetic, loop_messages, tmp_path):
+    bag = synthetic.write_bag(tmp_path / 'bag', {
+        f'/lab{topic}': entries for topic, entries in loop_messages.items()})
+    assert replay(bag, tmp_path / 'new', OWN).namespace == '/lab'
+
+
+def test_mechanism_is_that_of_the_device_unless_it_is_given(loop_bag, same, tmp_path):
+    assert same[0].mechanism == 'prototype'
+    found = replay(loop_bag, tmp_path / 'new', {**OWN, 'mechanism': 'paper'})
+    assert found.mechanism == 'paper'
+    assert not compare(found).identical
+
+
+def test_settings_act(loop_bag, tmp_path):
+    """With ten times the noise in mind, innovations look a hundred times as probable."""
+    found = numbers(loop_bag, tmp_path / 'new', angle_noise=0.017453, counts_per_turn=0)
+    assert found['settings']['angle_noise'] == 0.017453
+    nis = found['nis_per_degree_of_freedom']
+    assert 0.005 < nis['replayed'] / nis['recorded'] < 0.02
+    assert not found['identical']
+
+
+@pytest.mark.parametrize(('values', 'told'), [
+    ({'angle_nose': 1.0}, 'unknown setting angle_nose .known are mechanism, angle_noise'),
+    ({'angle_noise': 0.0}, 'angle_noise must be between 1e-09 and 1 rad'),
+    ({'angle_noise': float('nan')}, 'angle_noise must be between'),
+    ({'counts_per_turn': 0.5}, 'counts_per_turn must be of type int'),
+    ({'gate_probability': True}, 'gate_probability must be of type float'),
+    ({'mechanism': 'papre'}, 'available are paper, prototype')])
+def test_bad_settings_are_refused(loop_bag, tmp_path, values, told):
+    with pytest.raises(FourbarError, match=told):
+        replay(loop_bag, tmp_path / 'new', values)
+    assert not (tmp_path / 'new').exists()
+
+
+# The comparison
+
+def test_differences_are_what_the_recorded_estimate_was_moved_by(
+        synthetic, loop_messages, tmp_path):
+    """By a constant, so rms and largest are that; a whole turn is no difference."""
+    angles, rates = np.array([0.01, -0.02, 0.03, 2 * np.pi]), np.array([0.1, 0.2, -0.3, 0.0])
+
+    def moved(_, message):
+        stamp = message.header.stamp
+        return [synthetic.joint_state(
+            stamp.sec * 10**9 + stamp.nanosec, message.name, message.position + angles,
+            message.velocity + rates)]
+
+    bag = synthetic.write_bag(
+        tmp_path / 'bag', changed(loop_messages, '/estimate/link_states', moved))
+    found = numbers(bag, tmp_path / 'new')
+    assert not found['identical']
+    by = np.stack([angles, rates])
+    by[0, 3] = 0.0
+    for link, name in enumerate(LINKS):
+        for amount, keys in zip(by[:, link], KINDS):
+            for key in keys:
+                assert found['replayed_minus_recorded'][name][key] == pytest.approx(
+                    abs(amount), abs=1e-12)
+        # And the truth tells which of the two was moved.
+        key = 'rate_rms_rad_s'
+        assert found['recorded_minus_truth'][name][key] >= 0.9 * abs(rates[link])
+        assert found['replayed_minus_truth'][name][key] < 0.05
+
+
+def test_what_comes_before_both_have_settled_does_not_count(
+        synthetic, loop_messages, tmp_path):
+    """A recorded estimator that began a second late is not held to what it said then."""
+    late = {topic: entries[100:] if topic.startswith('/estimate/') else entries
+            for topic, entries in loop_messages.items()}
+    bag = synthetic.write_bag(tmp_path / 'bag', late)
+    comparison = compare(replay(bag, tmp_path / 'new', OWN), 0.5)
+    stamps = read_bag(bag).joint_states('estimate/link_states').stamp_ns
+    assert comparison.from_ns == stamps[0] + 500_000_000
+    assert as_json(comparison)['replayed_minus_recorded']['samples'] == len(stamps) - 125
+
+
+def test_bag_without_estimates_and_truth_has_less_to_tell(synthetic, loop_messages, tmp_path):
+    bare = {topic: loop_messages[topic] for topic in ('/link_angles', '/flywheel_states')}
+    bag = synthetic.write_bag(tmp_path / 'bag', bare)
+    comparison = compare(replay(bag, tmp_path / 'new', {**OWN, 'mechanism': 'prototype'}))
+    found = as_json(comparison)
+    assert [name for name, _ in comparison.differences()] == []
+    assert found['identical'] is found['recorded'] is found['replayed_minus_truth'] is None
+    assert found['nis_per_degree_of_freedom']['recorded'] is None
+    assert found['nis_per_degree_of_freedom']['replayed'] == pytest.approx(1.0, abs=0.2)
+    assert 'no estimates in the bag' in as_text(comparison)
+    assert png(comparison).startswith(b'\x89PNG')
+
+
+def test_messages_of_no_use_are_counted_and_the_run_goes_on(synthetic, loop_messages, tmp_path):
+    def spoilt(index, message):
+        bad = {100: ([*LINKS[:3], 'link_x'], [0.0] * 4), 200: (LINKS, [np.nan] * 4),
+               300: (LINKS, [0.0])}
+        return [message, *([synthetic.joint_state(10**9, *bad[index])] if index in bad else [])]
+
+    def backwards(index, message):
+        return [message, *([synthetic.joint_state(1_100_000_000, synthetic.WHEELS, (), [0.0] * 4)]
+                           if index == 250 else [])]
+
+    messages = changed(changed(loop_messages, '/link_angles', spoilt),
+                       '/flywheel_states', backwards)
+    found = numbers(synthetic.write_bag(tmp_path / 'bag', messages), tmp_path / 'new')
+    assert found['replayed']['rejected'] == {'names': 1, 'finite': 1, 'length': 1, 'stamp': 1}
+    # None of them left a trace.
+    assert found['identical']
+
+
+def test_tick_that_was_sent_again_is_answered_again(synthetic, loop_messages, tmp_path):
+    messages = changed(loop_messages, '/flywheel_states',
+                       lambda index, message: [message] * (2 if index == 300 else 1))
+    found = replay(synthetic.write_bag(tmp_path / 'bag', messages), tmp_path / 'new', OWN)
+    assert compare(found).identical
+    states = read_bag(tmp_path / 'new').arrivals('estimate/link_states')
+    assert np.sum(np.diff(states.stamp_ns) == 0) == 1
+
+
+def test_gated_samples_and_faults_are_told(synthetic, loop_messages, tmp_path):
+    """Link c is 0.1 rad off for half a second; the recorded estimator told of other things."""
+    def off(index, message):
+        if not 200 <= index < 325 or 'link_c' not in message.name:
+            return [message]
+        stamp = message.header.stamp
+        return [synthetic.joint_state(
+            stamp.sec * 10**9 + stamp.nanosec, message.name,
+            message.position + 0.1 * (np.array(message.name) == 'link_c'))]
+
+    messages = changed(loop_messages, '/link_angles', off)
+    types = synthetic.STORE.types
+    said = synthetic.status(starts='3', sensor_faults='link_a: no data', gated_link_b='7',
+                            rejected_late='2')
+    said.name = 'estimator'
+    header = synthetic.joint_state(0, ()).header
+    logged = messages['/flywheel_states'][-1][0]
+    messages['/diagnostics'] = [(logged, types['diagnostic_msgs/msg/DiagnosticArray'](
+        header=header, status=[synthetic.status(starts='9'), said]))]
+    comparison = compare(
+        replay(synthetic.write_bag(tmp_path / 'bag', messages), tmp_path / 'new', OWN))
+    found = as_json(comparison)
+    assert found['recorded'] == {'starts': 3, 'rejected': {'late': 2}, 'gated': {'link_b': 7},
+                                 'faults': {'link_a: no data': None}}
+    assert 100 < found['replayed']['gated']['link_c'] <= 125
+    assert 0.3 < found['replayed']['faults']['link_c: samples far off'] < 1.0
+    text = as_text(comparison)
+    for word in ('link_c: samples far off', 'link_a: no data', 'gated samples'):
+        assert word in text
+
+
+def test_replay_without_an_estimate_says_why(synthetic, loop_messages, tmp_path):
+    messages = changed(loop_messages, '/link_angles',
+                       lambda _, message: [synthetic.joint_state(10**9, ['link_x'], [0.0])])
+    found = replay(synthetic.write_bag(tmp_path / 'bag', messages), tmp_path / 'new', OWN)
+    with pytest.raises(ReplayError, match='rejected: names '):
+        compare(found)
+
+
+def test_skip_beyond_the_end_is_refused(same):
+    with pytest.raises(ReplayError, match='skip less'):
+        compare(same[0], 100.0)
+
+
+# Bags that will not do
+
+def complaint(bag, tmp_path, **options):
+    with pytest.raises(BagError) as caught:
+        replay(bag, tmp_path / 'new', OWN, **options)
+    assert not (tmp_path / 'new').exists()
+    message = str(caught.value)
+    assert str(bag) in message
+    assert '\n' not in message
+    return message
+
+
+def test_what_is_no_bag_is_said_to_be_none(synthetic, tmp_path):
+    assert 'no such directory' in complaint(tmp_path / 'nowhere', tmp_path)
+    (tmp_path / 'notes.txt').write_text('x')
+    assert 'is not a bag' in complaint(tmp_path / 'notes.txt', tmp_path)
+    (tmp_path / 'false.mcap').write_text('x' * 100)
+    assert 'cannot be read' in complaint(tmp_path / 'false.mcap', tmp_path)
+    (tmp_path / 'false.db3').write_text('x' * 100)
+    assert 'cannot be read' in complaint(tmp_path / 'false.db3', tmp_path)
+    assert 'no metadata.yaml' in complaint(tmp_path, tmp_path)
+
+
+def test_bag_of_a_killed_recorder_comes_with_the_repair(synthetic, loop_bag, tmp_path):
+    bag = tmp_path / 'killed'
+    bag.mkdir()
+    (bag / 'killed.mcap').write_bytes(next(loop_bag.glob('*.mcap')).read_bytes())
+    assert 'ros2 bag reindex -s mcap' in complaint(bag, tmp_path)
+
+
+def test_empty_bag_is_refused(synthetic, tmp_path):
+    bag = synthetic.write_bag(tmp_path / 'bag', {'/flywheel_states': [], '/link_angles': []})
+    assert 'holds no messages' in complaint(bag, tmp_path)
+
+
+@pytest.mark.parametrize('missing', ['/link_angles', '/flywheel_states'])
+def test_topics_that_are_there_are_told_where_one_is_missing(
+        synthetic, loop_messages, tmp_path, missing):
+    less = {topic: entries[:5] for topic, entries in loop_messages.items() if topic != missing}
+    message = complaint(synthetic.write_bag(tmp_path / 'bag', less), tmp_path)
+    assert f'no topic {missing}: it has /device_status, /estimate/covariance' in message
+    silent = {**less, missing: []}
+    assert f'no message on {missing}' in complaint(
+        synthetic.write_bag(tmp_path / 'silent', silent), tmp_path)
+
+
+@pytest.mark.parametrize('topic', ['/link_angles', '/flywheel_states', '/sim/link_states'])
+def test_wrong_type_is_told(synthetic, loop_messages, tmp_path, topic):
+    wrong = {**{name: entries[:5] for name, entries in loop_messages.items()},
+             topic: [(1, synthetic.status(state='armed'))]}
+    assert f'{topic} is diagnostic_msgs/msg/DiagnosticStatus, not sensor_msgs' in complaint(
+        synthetic.write_bag(tmp_path / 'bag', wrong), tmp_path)
+
+
+def test_bag_cut_anywhere_is_refused(loop_bag, tmp_path):
+    content = next(loop_bag.glob('*.mcap')).read_bytes()
+    file = tmp_path / 'cut.mcap'
+    for share in (0.0, 0.01, 0.5, 0.999):
+        file.write_bytes(content[:int(share * len(content))])
+        complaint(file, tmp_path)
+
+
+def test_bag_that_lost_messages_is_refused(synthetic, loop_messages, tmp_path):
+    """Its metadata tells of more."""
+    bag = synthetic.write_bag(tmp_path / 'bag', loop_messages, StoragePlugin.SQLITE3)
+    with sqlite3.connect(bag / 'bag.db3') as base:
+        base.execute('DELETE FROM messages WHERE id > 1500')
+    with pytest.raises(BagError, match=r'is cut: 1500 of \d+ messages are left'):
+        replay(bag, tmp_path / 'new', OWN)

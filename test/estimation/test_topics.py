@@ -1,0 +1,95 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The estimator behind its topics says what the estimator says."""
+
+from dataclasses import fields
+
+from fourbar_ros.estimation import Estimator, EstimatorSettings
+from fourbar_ros.estimation.parameters import PARAMETERS, SETTINGS
+from fourbar_ros.estimation.topics import Answer, EstimatorTopics, INPUTS, OUTPUTS
+from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism
+import numpy as np
+import pytest
+
+ANGLES = [0.1, 1.2, 0.1, 1.2]
+TICK_NS = 4_000_000
+
+
+@pytest.fixture
+def topics(paper: Mechanism) -> EstimatorTopics:
+    return EstimatorTopics(paper, EstimatorSettings())
+
+
+def tick(topics: EstimatorTopics, number: int, speed: float = 0.0) -> Answer:
+    return topics.receive('flywheel_states', number * TICK_NS, FLYWHEEL_NAMES, [0.0] * 4,
+                          [speed] * 4, [0.0] * 4)
+
+
+def sample(topics: EstimatorTopics, number: int) -> Answer:
+    return topics.receive('link_angles', number * TICK_NS, LINK_NAMES, ANGLES, [], [])
+
+
+def test_settings_are_the_fields_with_their_defaults() -> None:
+    assert {row.name: row.default for row in SETTINGS} == {
+        item.name: item.default for item in fields(EstimatorSettings)}
+    assert [row.name for row in PARAMETERS] == ['mechanism', *(row.name for row in SETTINGS)]
+
+
+def test_tick_without_estimate_is_answered(topics: EstimatorTopics) -> None:
+    message, = tick(topics, 1).messages
+    assert (message.topic, message.stamp_ns) == ('estimate/waiting', TICK_NS)
+
+
+def test_everything_of_an_estimate_is_said(topics: EstimatorTopics, paper: Mechanism) -> None:
+    plain = Estimator(paper, EstimatorSettings())
+    for number in (1, 2):
+        assert sample(topics, number) == Answer()
+        plain.measure(number * TICK_NS, LINK_NAMES, ANGLES)
+        answer, estimate = tick(topics, number, 0.1), plain.tick(number * TICK_NS, [0.1] * 4)
+    assert estimate is not None
+    assert estimate.innovation is not None
+    said = {message.topic: message for message in answer.messages}
+    assert list(said) == list(OUTPUTS)
+    for topic, message in said.items():
+        assert (message.stamp_ns, message.names[:len(OUTPUTS[topic].names)]) == (
+            2 * TICK_NS, OUTPUTS[topic].names)
+        assert len(message.values) == len(OUTPUTS[topic].fields)
+        assert all(len(values) == len(message.names) for values in message.values)
+    assert np.array_equal(said['estimate/link_states'].values,
+                          [estimate.link_angles, estimate.link_rates])
+    assert np.array_equal(said['estimate/sigma'].values,
+                          [estimate.angle_sigmas, estimate.rate_sigmas])
+    innovation = estimate.innovation
+    assert said['estimate/innovation'].values[0].tolist() == [
+        innovation.nis, innovation.degrees_of_freedom, *innovation.angles]
+    covariance = dict(zip(said['estimate/covariance'].names,
+                          said['estimate/covariance'].values[0], strict=True))
+    assert covariance['phi_b.phi_b'] == estimate.covariance[1, 1]
+    assert covariance['phi_a.omega_b'] == estimate.covariance[0, 3]
+
+
+def test_tick_that_comes_again_gets_the_same_answer(topics: EstimatorTopics) -> None:
+    sample(topics, 1)
+    assert tick(topics, 1) is tick(topics, 1)
+    assert not topics.estimator.rejected
+
+
+@pytest.mark.parametrize('topic', INPUTS)
+def test_what_is_of_no_use_is_told(topics: EstimatorTopics, topic: str) -> None:
+    answer = topics.receive(topic, TICK_NS, ['link_x'], [0.0], [0.0], [0.0])
+    assert answer.rejection == topics.estimator.last_rejection != ''
+    # A tick is answered all the same: a lock-step waits for it.
+    assert [message.topic for message in answer.messages] == (
+        ['estimate/waiting'] if topic == 'flywheel_states' else [])
