@@ -199,7 +199,7 @@ class Estimator:
             measurement = read_measurement(stamp_ns, names, angles, rates)
             self._check_time(measurement)
         except RejectedError as error:
-            self._reject(error)
+            self.reject(error)
             if error.kind in ('finite', 'late'):
                 reason = LATE if error.kind == 'late' else NOT_FINITE
                 for name in names:
@@ -267,7 +267,7 @@ class Estimator:
         try:
             self._check_tick(stamp_ns, speeds, efforts)
         except RejectedError as error:
-            self._reject(error)
+            self.reject(error)
             raise
         self._open_period(stamp_ns, speeds, efforts)
         innovation = self._relive(*self._sort_in())
@@ -287,6 +287,11 @@ class Estimator:
         self._pending.clear()
         self._begin_anew()
 
+    def reject(self, error: RejectedError) -> None:
+        """Count a message that cannot be used."""
+        self.rejected[error.kind] += 1
+        self.last_rejection = str(error)
+
     def _estimate(self, linkage: LinkageFilter, stamp_ns: int, innovation: Innovation | None,
                   decisions: tuple[Decision, ...]) -> Estimate:
         x, sigmas = linkage.x.copy(), linkage.sigmas()
@@ -296,10 +301,6 @@ class Estimator:
             x[TORQUES], sigmas[TORQUES],
             {gyro - GYROS: float(bias) for gyro, bias in zip(linkage.gyros, x[BIASES:])},
             innovation, decisions)
-
-    def _reject(self, error: RejectedError) -> None:
-        self.rejected[error.kind] += 1
-        self.last_rejection = str(error)
 
     def _decide(self, decision: Decision) -> None:
         self._decisions[decision.sensor] = decision
@@ -392,7 +393,7 @@ class Estimator:
         for measurement in self._pending:
             ahead_ns = measurement.stamp_ns - history[-1].to_ns
             if ahead_ns > LONGEST_GAP_NS:
-                self._reject(RejectedError(
+                self.reject(RejectedError(
                     'future', f'measured {ahead_ns * 1e-9:g} s after the tick, limit '
                               f'{LONGEST_GAP_NS * 1e-9:g} s'))
             elif ahead_ns > 0:
@@ -403,7 +404,7 @@ class Estimator:
                 arrived.append(measurement)
                 changed = min(changed, n)
             else:
-                self._reject(RejectedError('late', 'measured before all that is remembered'))
+                self.reject(RejectedError('late', 'measured before all that is remembered'))
         self._pending = waiting
         return changed, arrived
 

@@ -172,8 +172,9 @@ def weigh(suspicions: Array, sensors: NDArray[np.int64], rows: Array, innovation
 @kernel
 def _stronger(suspicions: Array, sensor: int) -> Array:
     """Return the likelier of a sensor's two suspicions."""
-    old = suspicions[suspicions.shape[0] // 2 + sensor]
-    return old if old[LIKELIHOOD] > suspicions[sensor, LIKELIHOOD] else suspicions[sensor]
+    old: Array = suspicions[suspicions.shape[0] // 2 + sensor]
+    new: Array = suspicions[sensor]
+    return old if old[LIKELIHOOD] > new[LIKELIHOOD] else new
 
 
 @kernel

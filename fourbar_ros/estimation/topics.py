@@ -145,7 +145,9 @@ class EstimatorTopics:
             return self._last[1]
         try:
             if tuple(names) != FLYWHEEL_NAMES:
-                raise RejectedError('wheels', f'the names must be {", ".join(FLYWHEEL_NAMES)}')
+                error = RejectedError('wheels', f'the names must be {", ".join(FLYWHEEL_NAMES)}')
+                self.estimator.reject(error)
+                raise error
             estimate = self.estimator.tick(stamp_ns, velocity, effort)
         except RejectedError as error:
             return Answer((Message(WAITING, stamp_ns),), str(error))
@@ -158,7 +160,7 @@ def messages_of(stamp_ns: int, estimate: Estimate | None) -> tuple[Message, ...]
     """Say what the estimate of a tick is, or that there is none: either answers a lock-step."""
     if estimate is None:
         return (Message(WAITING, stamp_ns),)
-    messages = (
+    messages: tuple[Message, ...] = (
         Message(STATES, stamp_ns, LINK_NAMES, (estimate.link_angles, estimate.link_rates)),
         Message('estimate/sigma', stamp_ns, LINK_NAMES,
                 (estimate.angle_sigmas, estimate.rate_sigmas)),

@@ -207,9 +207,18 @@ def closed_loop_messages(scenario, namespace=''):
         add('estimate/covariance', joint_state(
             stamp, [f'{row}.{column}' for n, row in enumerate(STATES) for column in STATES[n:]],
             [estimate.covariance[m, n] for m in range(count) for n in range(m, count)]))
+        add('estimate/disturbance', joint_state(
+            stamp, ['torque_a', 'torque_b', 'sigma_a', 'sigma_b'],
+            [*estimate.disturbance, *estimate.disturbance_sigmas]))
+        if estimate.decisions:
+            add('estimate/decisions', joint_state(
+                stamp, [SENSOR_NAMES[decision.sensor] for decision in estimate.decisions],
+                [float(decision.reason) for decision in estimate.decisions],
+                [decision.square for decision in estimate.decisions],
+                [float(decision.reason == 0) for decision in estimate.decisions]))
         if (seen := estimate.innovation) is not None:
             add('estimate/innovation', joint_state(
                 stamp, ['nis', 'degrees_of_freedom',
                         *(SENSOR_NAMES[sensor] for sensor in seen.sensors)],
-                [seen.nis, np.sum(seen.used), *seen.angles]))
+                [seen.nis, np.sum(seen.used), *seen.values]))
     return topics

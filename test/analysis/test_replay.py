@@ -30,7 +30,7 @@ from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin, Writer
 # With which the run was made.
 OWN = asdict(load_scenario('prototype').estimator)
 LINKS = ('link_a', 'link_b', 'link_c', 'link_d')
-ESTIMATES = ('link_states', 'sigma', 'covariance', 'innovation')
+ESTIMATES = ('link_states', 'sigma', 'covariance', 'disturbance', 'decisions', 'innovation')
 KINDS = (('angle_rms_rad', 'angle_max_rad'), ('rate_rms_rad_s', 'rate_max_rad_s'))
 
 

@@ -27,6 +27,9 @@ ANGLES = [0.1, 1.2, 0.1, 1.2]
 TICK_NS = 4_000_000
 
 
+GYROS = [0.01, -0.01, 0.02, 0.0]
+
+
 @pytest.fixture
 def topics(paper: Mechanism) -> EstimatorTopics:
     return EstimatorTopics(paper, EstimatorSettings())
@@ -38,7 +41,7 @@ def tick(topics: EstimatorTopics, number: int, speed: float = 0.0) -> Answer:
 
 
 def sample(topics: EstimatorTopics, number: int) -> Answer:
-    return topics.receive('link_angles', number * TICK_NS, LINK_NAMES, ANGLES, [], [])
+    return topics.receive('link_angles', number * TICK_NS, LINK_NAMES, ANGLES, GYROS, [])
 
 
 def test_settings_are_the_fields_with_their_defaults() -> None:
@@ -56,7 +59,7 @@ def test_everything_of_an_estimate_is_said(topics: EstimatorTopics, paper: Mecha
     plain = Estimator(paper, EstimatorSettings())
     for number in (1, 2):
         assert sample(topics, number) == Answer()
-        plain.measure(number * TICK_NS, LINK_NAMES, ANGLES)
+        plain.measure(number * TICK_NS, LINK_NAMES, ANGLES, GYROS)
         answer, estimate = tick(topics, number, 0.1), plain.tick(number * TICK_NS, [0.1] * 4)
     assert estimate is not None
     assert estimate.innovation is not None
@@ -73,7 +76,12 @@ def test_everything_of_an_estimate_is_said(topics: EstimatorTopics, paper: Mecha
                           [estimate.angle_sigmas, estimate.rate_sigmas])
     innovation = estimate.innovation
     assert said['estimate/innovation'].values[0].tolist() == [
-        innovation.nis, innovation.degrees_of_freedom, *innovation.angles]
+        innovation.nis, innovation.degrees_of_freedom, *innovation.values]
+    assert said['estimate/innovation'].names[-1] == 'gyro_link_d'
+    assert said['estimate/gyro_bias'].values[0].tolist() == list(estimate.gyro_biases.values())
+    reasons, squares, freedom = said['estimate/decisions'].values
+    assert reasons.tolist() == [0.0] * 4 and freedom.tolist() == [1.0] * 4
+    assert squares.tolist() == [decision.square for decision in estimate.decisions]
     covariance = dict(zip(said['estimate/covariance'].names,
                           said['estimate/covariance'].values[0], strict=True))
     assert covariance['phi_b.phi_b'] == estimate.covariance[1, 1]
