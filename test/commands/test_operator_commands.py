@@ -19,6 +19,7 @@ from math import radians
 from pathlib import Path
 
 import pytest
+from std_srvs.srv import SetBool, Trigger
 
 pytestmark = pytest.mark.node
 
@@ -86,6 +87,52 @@ def test_nobody_there_is_said_in_one_line(without_nodes, name):
     assert (code, out) == (2, '')
     line, = err.splitlines()
     assert line.startswith(f'fourbar {name}: no device found')
+
+
+class Lossy:
+    """
+    A service of the device that obeys every request, and whose first answer gets lost.
+
+    :ivar asked: how often it was asked.
+    """
+
+    def __init__(self, node, kind, name):
+        self.asked = 0
+        self._service = node.create_service(kind, name, self._obey)
+        self._send, self._service.send_response = self._service.send_response, self._answer
+
+    def _obey(self, _request, response):
+        self.asked += 1
+        response.success, response.message = True, f'obeyed {self.asked} times'
+        return response
+
+    def _answer(self, *answer):
+        if self.asked > 1:
+            self._send(*answer)
+
+
+@pytest.fixture(scope='module')
+def with_lossy(module_suite, make_probe):
+    """Run commands at once whose first answer gets lost, in a namespace of its own."""
+    there = make_probe('/lossy')
+    services = {'arm': Lossy(there.node, SetBool, 'arm'),
+                'sim': Lossy(there.node, Trigger, 'sim/step')}
+    started = {name: module_suite.start(name, *arguments, '--ros-args', '-r', '__ns:=/lossy')
+               for name, arguments in (('arm', []), ('sim', ['step']))}
+    for process in started.values():
+        there.wait(lambda popen=process.popen: popen.poll() is not None)
+    return {name: (services[name].asked, process.end(), process.stdout, process.stderr)
+            for name, process in started.items()}
+
+
+def test_lost_answer_is_asked_for_again(with_lossy):
+    assert with_lossy['arm'] == (2, 0, 'obeyed 2 times\n', '')
+
+
+def test_what_must_not_be_done_twice_is_not_asked_for_again(with_lossy):
+    asked, code, out, err = with_lossy['sim']
+    assert (asked, code, out) == (1, 2, '')
+    assert err == 'fourbar sim: no answer from service /lossy/sim/step within 5 s\n'
 
 
 def test_arm_and_disarm(testbed, fourbar):
