@@ -30,6 +30,7 @@ harness = module_from_spec(_spec)
 _spec.loader.exec_module(harness)
 compiled, domain, shared_memory = harness.compiled, harness.domain, harness.shared_memory
 module_suite, make_probe, probe = harness.module_suite, harness.make_probe, harness.probe
+nursery = harness.nursery
 
 COMMANDS = {'arm': [], 'disarm': [], 'stop': [], 'reset': [], 'status': [],
             'setpoint': ['link_a=0']}
@@ -38,8 +39,8 @@ COMMANDS = {'arm': [], 'disarm': [], 'stop': [], 'reset': [], 'status': [],
 @pytest.fixture(scope='module')
 def fourbar(module_suite):
     """Return a function that runs a command to its end: exit code, stdout, stderr."""
-    def run(name, *arguments):
-        process = module_suite.start(name, *arguments)
+    def run(name, *arguments, fresh=False):
+        process = module_suite.start(name, *arguments, fresh=fresh)
         return process.end(), process.stdout, process.stderr
     return run
 
@@ -68,27 +69,6 @@ def armed(testbed):
     return testbed
 
 
-@pytest.fixture(scope='module')
-def without_nodes(module_suite):
-    """Run all commands at once where there is nobody, in a namespace of its own."""
-    started = {name: module_suite.start(name, *arguments, '--ros-args', '-r', '__ns:=/nobody')
-               for name, arguments in COMMANDS.items()}
-    return {name: (process.end(), process.stdout, process.stderr)
-            for name, process in started.items()}
-
-
-@pytest.mark.parametrize('name', list(COMMANDS))
-def test_nobody_there_is_said_in_one_line(without_nodes, name):
-    code, out, err = without_nodes[name]
-    if name == 'status':
-        assert (code, err) == (1, '')
-        assert out.count('not found') == 2
-        return
-    assert (code, out) == (2, '')
-    line, = err.splitlines()
-    assert line.startswith(f'fourbar {name}: no device found')
-
-
 class Lossy:
     """
     A service of the device that obeys every request, and whose first answer gets lost.
@@ -112,34 +92,61 @@ class Lossy:
 
 
 @pytest.fixture(scope='module')
-def with_lossy(module_suite, make_probe):
-    """Run commands at once whose first answer gets lost, in a namespace of its own."""
+def unanswered(module_suite, make_probe):
+    """
+    Run commands, all at once, that get no answer or not the first one.
+
+    :returns: exit code, stdout and stderr by namespace and name; and how often the services
+        of /lossy were asked, by their names.
+    """
     there = make_probe('/lossy')
     services = {'arm': Lossy(there.node, SetBool, 'arm'),
-                'sim': Lossy(there.node, Trigger, 'sim/step')}
-    started = {name: module_suite.start(name, *arguments, '--ros-args', '-r', '__ns:=/lossy')
-               for name, arguments in (('arm', []), ('sim', ['step']))}
+                'sim/step': Lossy(there.node, Trigger, 'sim/step')}
+    started = {(namespace, name): module_suite.start(
+        name, *arguments, '--ros-args', '-r', f'__ns:={namespace}')
+        for namespace, name, arguments in (
+            ('/lossy', 'arm', []), ('/lossy', 'sim', ['step']),
+            *(('/nobody', name, arguments) for name, arguments in COMMANDS.items()))}
     for process in started.values():
         there.wait(lambda popen=process.popen: popen.poll() is not None)
-    return {name: (services[name].asked, process.end(), process.stdout, process.stderr)
-            for name, process in started.items()}
+    return ({key: (process.end(), process.stdout, process.stderr)
+             for key, process in started.items()},
+            {name: service.asked for name, service in services.items()})
 
 
-def test_lost_answer_is_asked_for_again(with_lossy):
-    assert with_lossy['arm'] == (2, 0, 'obeyed 2 times\n', '')
+@pytest.mark.parametrize('name', list(COMMANDS))
+def test_nobody_there_is_said_in_one_line(unanswered, name):
+    code, out, err = unanswered[0]['/nobody', name]
+    if name == 'status':
+        assert (code, err) == (1, '')
+        assert out.count('not found') == 2
+        return
+    assert (code, out) == (2, '')
+    line, = err.splitlines()
+    assert line.startswith(f'fourbar {name}: no device found')
 
 
-def test_what_must_not_be_done_twice_is_not_asked_for_again(with_lossy):
-    asked, code, out, err = with_lossy['sim']
-    assert (asked, code, out) == (1, 2, '')
-    assert err == 'fourbar sim: no answer from service /lossy/sim/step within 5 s\n'
+def test_lost_answer_is_asked_for_again(unanswered):
+    results, asked = unanswered
+    code, out, err = results['/lossy', 'arm']
+    assert (code, out.split()[0], err) == (0, 'obeyed', '')
+    # As often as it was asked until then: the second time, or later on a busy machine.
+    assert 2 <= int(out.split()[1]) <= asked['arm']
+
+
+def test_what_must_not_be_done_twice_is_not_asked_for_again(unanswered):
+    results, asked = unanswered
+    assert results['/lossy', 'sim'] == (
+        2, '', 'fourbar sim: no answer from service /lossy/sim/step within 5 s\n')
+    assert asked['sim/step'] == 1
 
 
 def test_arm_and_disarm(testbed, fourbar):
-    assert fourbar('arm') == (0, 'armed\n', '')
+    # As they are typed, once; forked everywhere else.
+    assert fourbar('arm', fresh=True) == (0, 'armed\n', '')
     assert testbed.status('device_status', state='armed')['reason'] == 'armed on request'
     assert fourbar('arm') == (0, 'already armed\n', '')
-    assert fourbar('disarm') == (0, 'disarmed\n', '')
+    assert fourbar('disarm', fresh=True) == (0, 'disarmed\n', '')
     testbed.status('device_status', state='disarmed')
 
 
