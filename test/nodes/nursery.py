@@ -21,6 +21,7 @@ tracers of the middleware, so a child begins where `python -m fourbar_ros` would
 imports, and ends as that would.
 """
 
+import gc
 import json
 import os
 import signal
@@ -108,6 +109,9 @@ def _serve():
     from fourbar_ros.loop.warm_up import warm_up
     from fourbar_ros.nodes import client, controller, estimator, plant, recorder  # noqa: F401
     warm_up()
+    # Else every child would copy all that, in order to search it for garbage at its end.
+    gc.collect()
+    gc.freeze()
     for line in sys.stdin:
         request = json.loads(line)
         if 'poll' in request:

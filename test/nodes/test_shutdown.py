@@ -140,11 +140,12 @@ def watched(domain, shared_memory, tmp_path_factory):
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     printed = {}
     try:
-        for key, process in started.items():
+        for process in started.values():
             # The middleware makes its threads before the node takes signals.
             deadline = time.monotonic() + 20.0
+            threads = Path(f'/proc/{process.pid}/task')
             while b'dds.' not in b''.join(
-                    path.read_bytes() for path in Path(f'/proc/{process.pid}/task').glob('*/comm')):
+                    path.read_bytes() for path in threads.glob('*/comm')):
                 assert process.poll() is None
                 assert time.monotonic() < deadline
                 time.sleep(0.05)
