@@ -30,7 +30,7 @@ harness = module_from_spec(_spec)
 _spec.loader.exec_module(harness)
 compiled, domain, shared_memory = harness.compiled, harness.domain, harness.shared_memory
 module_suite, make_probe, probe = harness.module_suite, harness.make_probe, harness.probe
-nursery = harness.nursery
+suite, nursery = harness.suite, harness.nursery
 
 COMMANDS = {'arm': [], 'disarm': [], 'stop': [], 'reset': [], 'status': [],
             'setpoint': ['link_a=0']}
@@ -199,8 +199,9 @@ def test_setpoint_that_cannot_be_read_never_reaches_ros(fourbar):
     assert "'link_b=up'" in line
 
 
-def test_commands_in_a_namespace(module_suite, make_probe, fourbar):
-    module_suite.nodes('/lab', controller={'setpoint_duration': 1.0})
+def test_commands_in_a_namespace(suite, make_probe, fourbar):
+    # Two loops at full rate are more than two cores can do.
+    suite.nodes('/lab', plant={'rate': 100.0}, controller={'setpoint_duration': 1.0})
     watcher = make_probe('/lab')
     watcher.follow('flywheel_command')
     watcher.newest('flywheel_command')
