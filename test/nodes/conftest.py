@@ -491,7 +491,7 @@ def suite(shared_memory, nursery, tmp_path):
 
 @pytest.fixture(scope='module')
 def make_probe(domain, shared_memory):
-    """Return a function that makes a probe, closed at the end of the module."""
+    """Return a function that makes a probe, closed at the end of the module; it has all probes."""
     probes = []
     # A full search for garbage in all that pytest has imported outlasts a command timeout.
     gc.collect()
@@ -500,6 +500,7 @@ def make_probe(domain, shared_memory):
     def make(namespace=''):
         probes.append(Probe(domain, namespace))
         return probes[-1]
+    make.probes = probes
     yield make
     shared_memory.note(os.getpid())
     for probe in probes:
