@@ -19,6 +19,7 @@ import time
 from diagnostic_msgs.msg import DiagnosticStatus
 from fourbar_ros.nodes.environment import RosError
 from fourbar_ros.nodes.messages import LATCHED, RELIABLE, SENSOR, stamp_of
+from fourbar_ros.nodes.question import Question
 from fourbar_ros.nodes.runtime import Runtime
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -123,7 +124,7 @@ class TestbedClient:
 
     def call(self, kind, service, request, patience=PATIENCE):
         """
-        Call one of the device's services.
+        Call one of the device's services, again if no answer comes and that does no harm.
 
         :param kind: its type.
         :returns: success and message of the response.
@@ -133,11 +134,10 @@ class TestbedClient:
         name = self.node.resolve_service_name(service)
         self.wait(client.service_is_ready, patience,
                   f'no device found: service {name} did not appear')
-        future = client.call_async(request)
-        self.wait(future.done, patience, f'no answer from service {name}')
-        response = future.result()
+        question = Question(client, service, request)
+        self.wait(question.answered, patience, f'no answer from service {name}')
         self.node.destroy_client(client)
-        return response.success, response.message
+        return question.response.success, question.response.message
 
     def switch(self, service, wanted):
         """Call a service that takes yes or no, `arm` or `sim/pause`: success and message."""

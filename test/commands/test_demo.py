@@ -35,7 +35,7 @@ _spec = spec_from_file_location('node_harness', _path)
 harness = module_from_spec(_spec)
 _spec.loader.exec_module(harness)
 compiled, domain, shared_memory = harness.compiled, harness.domain, harness.shared_memory
-module_suite, suite = harness.module_suite, harness.suite
+module_suite, suite, nursery = harness.module_suite, harness.suite, harness.nursery
 
 # Long enough for a motion of twelve seconds that a busy machine stretches.
 DEMO_S = 180.0
@@ -75,12 +75,12 @@ def both(module_suite, tmp_path_factory):
     output = tmp_path_factory.mktemp('demo') / 'out'
     output.mkdir()
     (output / 'notes.txt').write_text("not the demo's")
-    first = module_suite.start('demo', '--output', str(output))
+    first = module_suite.start('demo', '--output', str(output), fresh=True)
     wait_for(lambda: first.popen.poll() is not None or 'Turning' in first.stdout)
     assert first.popen.poll() is None, first.stderr
     started = children(first)
     rival_output = output.parent / 'rival'
-    rival = module_suite.start('demo', '--output', str(rival_output))
+    rival = module_suite.start('demo', '--output', str(rival_output), fresh=True)
     rival.end(seconds=60.0)
     first.end(seconds=DEMO_S)
     return {'first': first, 'rival': rival, 'output': output, 'rival_output': rival_output,
@@ -170,7 +170,7 @@ def test_second_demo_on_the_domain_is_refused_and_touches_nothing(both):
 
 
 def test_interrupt_during_the_motion_stops_everything(suite, tmp_path):
-    demo = suite.start('demo', '--output', str(tmp_path / 'out'))
+    demo = suite.start('demo', '--output', str(tmp_path / 'out'), fresh=True)
     wait_for(lambda: demo.popen.poll() is not None or 'Turning' in demo.stdout)
     started = children(demo)
     assert set(started) == CHILDREN
@@ -188,7 +188,7 @@ def test_interrupt_during_the_motion_stops_everything(suite, tmp_path):
 
 
 def test_parts_end_with_a_demo_that_is_killed(suite, shared_memory, tmp_path):
-    demo = suite.start('demo', '--output', str(tmp_path / 'out'))
+    demo = suite.start('demo', '--output', str(tmp_path / 'out'), fresh=True)
     wait_for(lambda: set(children(demo)) == CHILDREN or demo.popen.poll() is not None)
     started = children(demo)
     assert set(started) == CHILDREN, demo.stderr
@@ -202,7 +202,7 @@ def test_parts_end_with_a_demo_that_is_killed(suite, shared_memory, tmp_path):
 
 def test_output_that_cannot_be_written_is_refused(suite, tmp_path):
     (tmp_path / 'file').touch()
-    demo = suite.start('demo', '--output', str(tmp_path / 'file' / 'out'))
+    demo = suite.start('demo', '--output', str(tmp_path / 'file' / 'out'), fresh=True)
     assert demo.end(seconds=60.0) == 2
     line, = demo.stderr.splitlines()
     assert line.startswith('fourbar demo: cannot write to')

@@ -19,6 +19,7 @@ from math import radians
 from pathlib import Path
 
 import pytest
+from std_srvs.srv import SetBool, Trigger
 
 pytestmark = pytest.mark.node
 
@@ -29,6 +30,7 @@ harness = module_from_spec(_spec)
 _spec.loader.exec_module(harness)
 compiled, domain, shared_memory = harness.compiled, harness.domain, harness.shared_memory
 module_suite, make_probe, probe = harness.module_suite, harness.make_probe, harness.probe
+suite, nursery = harness.suite, harness.nursery
 
 COMMANDS = {'arm': [], 'disarm': [], 'stop': [], 'reset': [], 'status': [],
             'setpoint': ['link_a=0']}
@@ -37,8 +39,8 @@ COMMANDS = {'arm': [], 'disarm': [], 'stop': [], 'reset': [], 'status': [],
 @pytest.fixture(scope='module')
 def fourbar(module_suite):
     """Return a function that runs a command to its end: exit code, stdout, stderr."""
-    def run(name, *arguments):
-        process = module_suite.start(name, *arguments)
+    def run(name, *arguments, fresh=False):
+        process = module_suite.start(name, *arguments, fresh=fresh)
         return process.end(), process.stdout, process.stderr
     return run
 
@@ -67,18 +69,55 @@ def armed(testbed):
     return testbed
 
 
+class Lossy:
+    """
+    A service of the device that obeys every request, and whose first answer gets lost.
+
+    :ivar asked: how often it was asked.
+    """
+
+    def __init__(self, node, kind, name):
+        self.asked = 0
+        self._service = node.create_service(kind, name, self._obey)
+        self._send, self._service.send_response = self._service.send_response, self._answer
+
+    def _obey(self, _request, response):
+        self.asked += 1
+        response.success, response.message = True, f'obeyed {self.asked} times'
+        return response
+
+    def _answer(self, *answer):
+        if self.asked > 1:
+            self._send(*answer)
+
+
 @pytest.fixture(scope='module')
-def without_nodes(module_suite):
-    """Run all commands at once where there is nobody, in a namespace of its own."""
-    started = {name: module_suite.start(name, *arguments, '--ros-args', '-r', '__ns:=/nobody')
-               for name, arguments in COMMANDS.items()}
-    return {name: (process.end(), process.stdout, process.stderr)
-            for name, process in started.items()}
+def unanswered(module_suite, make_probe):
+    """
+    Run commands, all at once, that get no answer or not the first one.
+
+    :returns: exit code, stdout and stderr by namespace and name; and how often the services
+        of /lossy were asked, by their names.
+    """
+    there = make_probe('/lossy')
+    services = {'arm': Lossy(there.node, SetBool, 'arm'),
+                'reset_emergency_stop': Lossy(there.node, Trigger, 'reset_emergency_stop'),
+                'sim/step': Lossy(there.node, Trigger, 'sim/step')}
+    started = {(namespace, name): module_suite.start(
+        name, *arguments, '--ros-args', '-r', f'__ns:={namespace}')
+        for namespace, name, arguments in (
+            ('/lossy', 'disarm', []), ('/lossy', 'reset', []), ('/lossy', 'sim', ['step']),
+            *(('/nobody', name, arguments) for name, arguments in COMMANDS.items()))}
+    for process in started.values():
+        there.wait(lambda popen=process.popen: popen.poll() is not None)
+    return ({key: (process.end(), process.stdout, process.stderr)
+             for key, process in started.items()},
+            {name: service.asked for name, service in services.items()})
 
 
 @pytest.mark.parametrize('name', list(COMMANDS))
-def test_nobody_there_is_said_in_one_line(without_nodes, name):
-    code, out, err = without_nodes[name]
+def test_nobody_there_is_said_in_one_line(unanswered, name):
+    code, out, err = unanswered[0]['/nobody', name]
     if name == 'status':
         assert (code, err) == (1, '')
         assert out.count('not found') == 2
@@ -88,11 +127,29 @@ def test_nobody_there_is_said_in_one_line(without_nodes, name):
     assert line.startswith(f'fourbar {name}: no device found')
 
 
+def test_lost_answer_is_asked_for_again(unanswered):
+    results, asked = unanswered
+    code, out, err = results['/lossy', 'disarm']
+    assert (code, out.split()[0], err) == (0, 'obeyed', '')
+    # As often as it was asked until then: the second time, or later on a busy machine.
+    assert 2 <= int(out.split()[1]) <= asked['arm']
+
+
+@pytest.mark.parametrize(('name', 'service'), [
+    ('sim', 'sim/step'), ('reset', 'reset_emergency_stop')])
+def test_what_must_not_be_done_twice_is_not_asked_for_again(unanswered, name, service):
+    results, asked = unanswered
+    assert results['/lossy', name] == (
+        2, '', f'fourbar {name}: no answer from service /lossy/{service} within 5 s\n')
+    assert asked[service] == 1
+
+
 def test_arm_and_disarm(testbed, fourbar):
-    assert fourbar('arm') == (0, 'armed\n', '')
+    # As they are typed, once; forked everywhere else.
+    assert fourbar('arm', fresh=True) == (0, 'armed\n', '')
     assert testbed.status('device_status', state='armed')['reason'] == 'armed on request'
     assert fourbar('arm') == (0, 'already armed\n', '')
-    assert fourbar('disarm') == (0, 'disarmed\n', '')
+    assert fourbar('disarm', fresh=True) == (0, 'disarmed\n', '')
     testbed.status('device_status', state='disarmed')
 
 
@@ -145,8 +202,9 @@ def test_setpoint_that_cannot_be_read_never_reaches_ros(fourbar):
     assert "'link_b=up'" in line
 
 
-def test_commands_in_a_namespace(module_suite, make_probe, fourbar):
-    module_suite.nodes('/lab', controller={'setpoint_duration': 1.0})
+def test_commands_in_a_namespace(suite, make_probe, fourbar):
+    # Two loops at full rate are more than two cores can do.
+    suite.nodes('/lab', plant={'rate': 100.0}, controller={'setpoint_duration': 1.0})
     watcher = make_probe('/lab')
     watcher.follow('flywheel_command')
     watcher.newest('flywheel_command')

@@ -20,6 +20,7 @@ from pathlib import Path
 import subprocess
 import sys
 
+from fourbar_ros.commands.main import main
 import pytest
 
 
@@ -50,9 +51,10 @@ def test_files_are_beside_the_bag(bag):
     assert not list(bag.glob('*.html'))
 
 
-def test_files_go_where_they_are_asked_to(bag, tmp_path):
-    done = report(bag, '-o', 'a.html', '--metrics', 'b.json', '--mechanism', 'paper', cwd=tmp_path)
-    assert done.returncode == 0
+def test_files_go_where_they_are_asked_to(bag, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(['report', str(bag), '-o', 'a.html', '--metrics', 'b.json',
+                 '--mechanism', 'paper']) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ['a.html', 'b.json']
 
 
@@ -63,13 +65,23 @@ def test_files_go_where_they_are_asked_to(bag, tmp_path):
     (['{bag}', '--namespace', '/lab'], 'no topic setpoint'),
     (['{bag}', '-o', 'no/a.html'], 'cannot write'),
 ])
-def test_bad_input_is_one_line_and_exit_code_2(bag, tmp_path, arguments, complaint):
-    done = report(*(argument.format(bag=bag) for argument in arguments), cwd=tmp_path)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    assert done.stderr.startswith('fourbar report: ')
-    assert complaint in done.stderr
-    assert done.stdout == ''
+def test_bad_input_is_one_line_and_exit_code_2(
+        bag, tmp_path, monkeypatch, capfd, arguments, complaint):
+    monkeypatch.chdir(tmp_path)
+    assert main(['report', *(argument.format(bag=bag) for argument in arguments)]) == 2
+    out, err = capfd.readouterr()
+    assert len(err.splitlines()) == 1
+    assert err.startswith('fourbar report: ')
+    assert complaint in err
+    assert out == ''
+
+
+def test_bad_input_ends_a_process_with_one_line(tmp_path):
+    done = report('nowhere', cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, '')
+    line, = done.stderr.splitlines()
+    assert line.startswith('fourbar report: ')
+    assert 'no such directory' in line
 
 
 def test_help_needs_no_heavy_library(tmp_path):

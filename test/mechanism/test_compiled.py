@@ -60,40 +60,69 @@ print(json.dumps({{
 NOWHERE = '/dev/null/nowhere'  # below a file, so that not even root can write there
 
 
-@pytest.fixture
-def package(tmp_path):
-    """Make a tiny fourbar_ros whose kernels call across rooms."""
-    root = tmp_path / 'tree' / 'fourbar_ros'
-    for room in compiled.ROOMS:
-        (root / room).mkdir(parents=True)
-        (root / room / '__init__.py').touch()
-    (root / '__init__.py').touch()
-    source = Path(compiled.__file__).read_text()
-    (root / 'mechanism' / 'compiled.py').write_text(source)
-    (root / 'mechanism' / 'caller.py').write_text(CALLER)
-    (root / 'plant' / 'callee.py').write_text(CALLEE.format(factor=3.0))
-    return root
+class Tree:
+    """A tiny fourbar_ros whose kernels call across rooms, with a home to cache in."""
 
+    def __init__(self, folder):
+        self.folder = folder
+        self.root = folder / 'tree' / 'fourbar_ros'
+        for room in compiled.ROOMS:
+            (self.root / room).mkdir(parents=True)
+            (self.root / room / '__init__.py').touch()
+        (self.root / '__init__.py').touch()
+        source = Path(compiled.__file__).read_text()
+        (self.root / 'mechanism' / 'compiled.py').write_text(source)
+        (self.root / 'mechanism' / 'caller.py').write_text(CALLER)
+        (self.root / 'plant' / 'callee.py').write_text(CALLEE.format(factor=3.0))
 
-@pytest.fixture
-def run(package, tmp_path):
-    """Return a function that runs the kernels in a fresh process with one place to cache in."""
-    def run(temporary=str(tmp_path), **environment):
+    def run(self, temporary=None, **environment):
+        """Run the kernels in a fresh process with one place to cache in."""
         inherited = {key: value for key, value in os.environ.items()
                      if not key.startswith('NUMBA_') and key != 'XDG_CACHE_HOME'}
         result = subprocess.run(
-            [sys.executable, '-c', PROGRAM.format(temporary=temporary)],
+            [sys.executable, '-c', PROGRAM.format(temporary=temporary or str(self.folder))],
             cwd='/', capture_output=True, text=True, env={
-                **inherited, 'HOME': str(tmp_path / 'home'), 'PYTHONPATH': str(package.parent),
-                **environment})
+                **inherited, 'HOME': str(self.folder / 'home'),
+                'PYTHONPATH': str(self.root.parent), **environment})
         assert result.returncode == 0, result.stderr
         return {'notes': result.stderr.splitlines(), **json.loads(result.stdout)}
-    return run
 
 
-def test_second_process_loads_what_the_first_compiled(run):
-    assert run()['loaded'] == 0
-    assert run()['loaded'] == 1
+@pytest.fixture
+def tree(tmp_path):
+    return Tree(tmp_path)
+
+
+@pytest.fixture
+def package(tree):
+    return tree.root
+
+
+@pytest.fixture
+def run(tree):
+    return tree.run
+
+
+@pytest.fixture(scope='module')
+def common(tmp_path_factory):
+    """Make a tree for tests that look at what the same few runs left behind."""
+    return Tree(tmp_path_factory.mktemp('common'))
+
+
+@pytest.fixture(scope='module')
+def first(common):
+    return common.run()
+
+
+@pytest.fixture(scope='module')
+def chosen(common, first):
+    """Run with a cache folder of the user's choice."""
+    return common.run(NUMBA_CACHE_DIR=str(common.folder / 'chosen'))
+
+
+def test_second_process_loads_what_the_first_compiled(common, first):
+    assert first['loaded'] == 0
+    assert common.run()['loaded'] == 1
 
 
 def test_edited_callee_in_another_module_is_seen(run, package):
@@ -106,32 +135,30 @@ def test_edited_callee_in_another_module_is_seen(run, package):
     assert run()['scaled'] == 10.0
 
 
-def test_division_by_zero_is_inf_as_in_numpy(run):
-    assert run()['inverse'] == float('inf')
+def test_division_by_zero_is_inf_as_in_numpy(first):
+    assert first['inverse'] == float('inf')
 
 
-def test_nothing_is_written_beside_the_sources(run, package):
-    run()
-    assert not list(package.rglob('*.nbi'))
+def test_nothing_is_written_beside_the_sources(common, first):
+    assert not list(common.root.rglob('*.nbi'))
 
 
-def test_cache_is_in_the_users_cache_folder(run, tmp_path):
-    home = Path(run()['directory'])
-    assert home.parent == tmp_path / 'home' / '.cache' / 'fourbar_ros'
-    xdg = Path(run(XDG_CACHE_HOME=str(tmp_path / 'xdg'))['directory'])
-    assert xdg == tmp_path / 'xdg' / 'fourbar_ros' / home.name
+def test_cache_is_in_the_users_cache_folder(common, first):
+    home = Path(first['directory'])
+    assert home.parent == common.folder / 'home' / '.cache' / 'fourbar_ros'
+    xdg = Path(common.run(XDG_CACHE_HOME=str(common.folder / 'xdg'))['directory'])
+    assert xdg == common.folder / 'xdg' / 'fourbar_ros' / home.name
     assert list(xdg.rglob('*.nbi'))
 
 
-def test_numba_cache_dir_of_the_user_wins(run, tmp_path):
-    chosen = tmp_path / 'chosen'
-    assert run(NUMBA_CACHE_DIR=str(chosen))['directory'] == str(chosen)
-    assert list(chosen.rglob('*.nbi'))
+def test_numba_cache_dir_of_the_user_wins(common, chosen):
+    assert chosen['directory'] == str(common.folder / 'chosen')
+    assert list((common.folder / 'chosen').rglob('*.nbi'))
 
 
-def test_other_code_keeps_its_own_cache_folder(run, tmp_path):
-    assert run()['numba'] == ''
-    assert run(NUMBA_CACHE_DIR=str(tmp_path))['numba'] == str(tmp_path)
+def test_other_code_keeps_its_own_cache_folder(common, first, chosen):
+    assert first['numba'] == ''
+    assert chosen['numba'] == str(common.folder / 'chosen')
 
 
 @pytest.mark.parametrize('variables', [

@@ -17,6 +17,7 @@
 from contextlib import contextmanager, suppress
 import fcntl
 import gc
+from importlib.util import module_from_spec, spec_from_file_location
 import os
 from pathlib import Path
 import signal
@@ -37,6 +38,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
+
+# Tests are no package: what they share is loaded from its file.
+_spec = spec_from_file_location('nursery', Path(__file__).with_name('nursery.py'))
+_nursery = module_from_spec(_spec)
+_spec.loader.exec_module(_nursery)
 
 DEADLINE_S = 20.0
 # Longest time without a command: more than this machine holds a process up.
@@ -99,19 +105,25 @@ class Process:
 
     :param folder: for what it prints.
     :param shared_memory: takes note of what it owns.
+    :param nursery: where to fork it, None for a fresh interpreter.
     :ivar awaited: whether somebody waited for its end.
     """
 
-    def __init__(self, name, arguments, environment, folder, shared_memory, **options):
+    def __init__(self, name, arguments, folder, shared_memory, nursery):
         self.name = name
         self.awaited = False
         self._shared_memory = shared_memory
         self._out, self._err = (folder / f'{stream}.txt' for stream in ('stdout', 'stderr'))
+        if nursery is not None:
+            self._out.touch()
+            self._err.touch()
+            self.popen = nursery.start(
+                [name, *arguments], folder, self._out, self._err, dict(os.environ))
+            return
         with self._out.open('wb') as out, self._err.open('wb') as err:
             self.popen = subprocess.Popen(
                 [sys.executable, '-m', 'fourbar_ros', name, *arguments], cwd=folder,
-                stdin=subprocess.DEVNULL, stdout=out, stderr=err,
-                env={**os.environ, **environment}, **options)
+                stdin=subprocess.DEVNULL, stdout=out, stderr=err)
 
     @property
     def stdout(self):
@@ -204,23 +216,30 @@ class Suite:
 
     :param folder: for what they print.
     :param shared_memory: takes note of what they own.
+    :param nursery: where to fork those that need no interpreter of their own.
     """
 
-    def __init__(self, folder, shared_memory):
+    def __init__(self, folder, shared_memory, nursery):
         self.folder = folder
         self._shared_memory = shared_memory
+        self._nursery = nursery
         self._started = []
 
-    def start(self, name, *arguments, environment=None, **options):
-        """Start `fourbar NAME ARGUMENTS`."""
+    def start(self, name, *arguments, fresh=False):
+        """
+        Start `fourbar NAME ARGUMENTS`.
+
+        :param fresh: as a user does, in an interpreter that has imported nothing: for tests of how
+            processes start and end.
+        """
         folder = self.folder / f'{len(self._started)}_{name}'
         folder.mkdir()
         process = Process(
-            name, arguments, environment or {}, folder, self._shared_memory, **options)
+            name, arguments, folder, self._shared_memory, None if fresh else self._nursery)
         self._started.append(process)
         return process
 
-    def node(self, name, parameters=None, namespace='', environment=None, arguments=()):
+    def node(self, name, parameters=None, namespace='', arguments=(), fresh=False):
         """Start a node with parameters in a namespace; a plant waits long for commands."""
         ros_args = ['--ros-args']
         patience = {'command_timeout': COMMAND_TIMEOUT_S} if name == 'plant' else {}
@@ -229,12 +248,11 @@ class Suite:
         if namespace:
             ros_args += ['-r', f'__ns:={namespace}']
         ros_args += arguments
-        return self.start(
-            name, *(ros_args if ros_args[1:] else ()), environment=environment)
+        return self.start(name, *(ros_args if ros_args[1:] else ()), fresh=fresh)
 
-    def nodes(self, namespace='', **parameters):
+    def nodes(self, namespace='', fresh=False, **parameters):
         """Start plant, estimator and controller; parameters by the name of the node."""
-        return {name: self.node(name, parameters.get(name), namespace)
+        return {name: self.node(name, parameters.get(name), namespace, fresh=fresh)
                 for name in ('plant', 'estimator', 'controller')}
 
     def close(self):
@@ -428,6 +446,14 @@ def compiled():
     warm_up()
 
 
+@pytest.fixture(scope='session')
+def nursery(compiled):
+    """Fork processes that need no interpreter of their own."""
+    nursery = _nursery.Nursery()
+    yield nursery
+    nursery.close()
+
+
 @pytest.fixture(scope='module')
 def domain(compiled):
     """Give the module a domain of its own, and its processes the environment for it."""
@@ -448,24 +474,24 @@ def shared_memory(domain):
 
 
 @pytest.fixture(scope='module')
-def module_suite(shared_memory, tmp_path_factory):
+def module_suite(shared_memory, nursery, tmp_path_factory):
     """Run processes until the end of the module."""
-    suite = Suite(tmp_path_factory.mktemp('module'), shared_memory)
+    suite = Suite(tmp_path_factory.mktemp('module'), shared_memory, nursery)
     yield suite
     suite.close()
 
 
 @pytest.fixture
-def suite(shared_memory, tmp_path):
+def suite(shared_memory, nursery, tmp_path):
     """Run processes until the end of the test."""
-    suite = Suite(tmp_path, shared_memory)
+    suite = Suite(tmp_path, shared_memory, nursery)
     yield suite
     suite.close()
 
 
 @pytest.fixture(scope='module')
 def make_probe(domain, shared_memory):
-    """Return a function that makes a probe, closed at the end of the module."""
+    """Return a function that makes a probe, closed at the end of the module; it has all probes."""
     probes = []
     # A full search for garbage in all that pytest has imported outlasts a command timeout.
     gc.collect()
@@ -474,6 +500,7 @@ def make_probe(domain, shared_memory):
     def make(namespace=''):
         probes.append(Probe(domain, namespace))
         return probes[-1]
+    make.probes = probes
     yield make
     shared_memory.note(os.getpid())
     for probe in probes:

@@ -35,7 +35,7 @@ def by_stamp(messages):
 @pytest.fixture(scope='module')
 def run(module_suite, probe):
     """Arm, move, settle; return all messages by topic and stamp."""
-    module_suite.nodes(controller={'setpoint_duration': DURATION_S})
+    module_suite.nodes(fresh=True, controller={'setpoint_duration': DURATION_S})
     topics = ('sim/link_states', 'sim/flywheel_states', 'estimate/link_states', 'estimate/sigma',
               'estimate/innovation', 'reference', 'tracking_error', 'energy')
     probe.follow(*topics)

@@ -48,23 +48,53 @@ def node(domain):
     rclpy.shutdown(context=context)
 
 
+class Record:
+    """`fourbar record`, which writes beside the files for what it prints."""
+
+    def __init__(self, start, printed):
+        self._out, self._err = printed / 'stdout', printed / 'stderr'
+        self._out.touch()
+        self._err.touch()
+        self.popen = start(self._out, self._err)
+
+    @property
+    def stdout(self):
+        return self._out.read_text()
+
+    def end(self, number=None):
+        """Return exit code, stdout and stderr, after a signal if one is given."""
+        if number is not None:
+            self.popen.send_signal(number)
+        return self.popen.wait(DEADLINE_S), self.stdout, self._err.read_text()
+
+
 @pytest.fixture
-def record(domain, tmp_path):
-    """Return a function that starts `fourbar record`; what is left of it ends with the test."""
+def record(domain, nursery, tmp_path, tmp_path_factory):
+    """
+    Return a function that starts `fourbar record`; what is left of it ends with the test.
+
+    In an interpreter that has imported nothing if it is to be `fresh`.
+    """
     started = []
 
-    def start(*arguments, **environment):
-        process = subprocess.Popen(
-            [sys.executable, '-m', 'fourbar_ros', 'record', *arguments], cwd=tmp_path, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, **environment})
-        started.append(process)
-        return process
+    def start(*arguments, fresh=False, **environment):
+        command, environment = ['record', *arguments], {**os.environ, **environment}
+
+        def begin(out, err):
+            if not fresh:
+                return nursery.start(command, tmp_path, out, err, environment)
+            with out.open('wb') as out_file, err.open('wb') as err_file:
+                return subprocess.Popen(
+                    [sys.executable, '-m', 'fourbar_ros', *command], cwd=tmp_path,
+                    stdout=out_file, stderr=err_file, env=environment)
+        started.append(Record(begin, tmp_path_factory.mktemp('printed')))
+        return started[-1]
 
     yield start
     for process in started:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+        if process.popen.poll() is None:
+            process.popen.kill()
+            process.popen.wait()
 
 
 def wait_for(condition):
@@ -84,13 +114,6 @@ def publish(publisher, count):
     time.sleep(0.2)
 
 
-def stop(process, number=signal.SIGINT):
-    """Return exit code, stdout and stderr after a signal."""
-    process.send_signal(number)
-    out, err = process.communicate(timeout=DEADLINE_S)
-    return process.returncode, out, err
-
-
 def numbers(bag, topic):
     """Return the numbers that were recorded on a topic, in order."""
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -103,13 +126,13 @@ def numbers(bag, topic):
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
 def test_every_message_is_in_the_bag_after_a_signal(node, record, tmp_path, number):
     first, second = (node.create_publisher(JointState, name, 10) for name in ('one', 'two'))
-    process = record('-o', 'bag')
+    process = record('-o', 'bag', fresh=number == signal.SIGINT)
     publish(first, 700)
     publish(second, 300)
     assert first.wait_for_all_acked(Duration(seconds=5))
     assert second.wait_for_all_acked(Duration(seconds=5))
 
-    code, out, err = stop(process, number)
+    code, out, err = process.end(number)
 
     assert (code, err) == (0, '')
     assert out.splitlines()[0] == 'recording to bag'
@@ -125,7 +148,7 @@ def test_topics_that_appear_later_are_recorded(node, record, tmp_path):
 
     publish(node.create_publisher(JointState, 'late', 10), 50)
 
-    assert stop(process)[0] == 0
+    assert process.end(signal.SIGINT)[0] == 0
     assert numbers(tmp_path / 'bag', '/late') == list(range(50))
 
 
@@ -138,7 +161,7 @@ def test_latched_message_from_before_is_recorded_as_latched(node, record, tmp_pa
     wait_for(lambda: latched.get_subscription_count() and weak.get_subscription_count())
     time.sleep(0.5)
 
-    assert stop(process)[0] == 0
+    assert process.end(signal.SIGINT)[0] == 0
 
     with Reader(tmp_path / 'bag') as reader:
         status = reader.topics['/status']
@@ -156,7 +179,7 @@ def test_named_topics_follow_the_namespace(node, record, tmp_path):
     for publisher in publishers[:2]:
         publish(publisher, 3)
 
-    assert stop(process)[0] == 0
+    assert process.end(signal.SIGINT)[0] == 0
 
     with Reader(tmp_path / 'bag') as reader:
         assert set(reader.topics) == {'/lab/wanted', '/absolute'}
@@ -169,7 +192,7 @@ def test_internal_topics_can_be_left_out(node, record, tmp_path, internal):
     process = record('-o', 'bag', *([] if internal else ['--exclude-internal']))
     publish(publisher, 1)
 
-    assert stop(process)[0] == 0
+    assert process.end(signal.SIGINT)[0] == 0
 
     with Reader(tmp_path / 'bag') as reader:
         assert ('/rosout' in reader.topics) == internal
@@ -183,10 +206,10 @@ def test_type_that_cannot_be_imported_is_named_once_and_the_rest_recorded(
     node.create_publisher(Point, 'foreign', 10)
     publisher = node.create_publisher(JointState, 'one', 10)
     path = os.pathsep.join([str(tmp_path / 'shadow'), os.environ.get('PYTHONPATH', '')])
-    process = record('-o', 'bag', PYTHONPATH=path)
+    process = record('-o', 'bag', fresh=True, PYTHONPATH=path)
     publish(publisher, 500)
 
-    code, out, _ = stop(process)
+    code, out, _ = process.end(signal.SIGINT)
 
     assert code == 0
     assert [line for line in out.splitlines() if '/foreign' in line] == [
@@ -197,9 +220,9 @@ def test_type_that_cannot_be_imported_is_named_once_and_the_rest_recorded(
 
 def test_nothing_received_still_makes_a_bag(record, tmp_path):
     process = record('-o', 'bag')
-    assert process.stdout.readline() == 'recording to bag\n'
+    wait_for(lambda: process.stdout.startswith('recording to bag\n'))
 
-    assert stop(process)[0] == 0
+    assert process.end(signal.SIGINT)[0] == 0
 
     with Reader(tmp_path / 'bag') as reader:
         assert reader.message_count == 0
@@ -217,9 +240,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(record, tmp_path, arguments, e
     (tmp_path / 'file').touch()
 
     process = record(*arguments, **environment)
-    out, err = process.communicate(timeout=DEADLINE_S)
+    code, out, err = process.end()
 
-    assert process.returncode == 2
+    assert code == 2
     assert out == ''
     assert len(err.splitlines()) == 1
     assert complaint in err

@@ -14,6 +14,7 @@
 
 """Every node ends when it is asked to: quickly, silently, and with the wheels let go."""
 
+from itertools import product
 from pathlib import Path
 import signal
 import subprocess
@@ -35,7 +36,7 @@ SIGNALS = pytest.mark.parametrize(
 def test_moving_testbed_ends_cleanly(suite, make_probe, number):
     """Controller, estimator, plant, in the middle of a move."""
     namespace = f'/{number.name.lower()}'
-    nodes = suite.nodes(namespace)
+    nodes = suite.nodes(namespace, fresh=True)
     probe = make_probe(namespace)
     probe.follow('flywheel_command', 'sim/flywheel_states', 'flywheel_states')
     probe.newest('flywheel_command')
@@ -63,10 +64,19 @@ def test_moving_testbed_ends_cleanly(suite, make_probe, number):
         nodes[name].check_clean()
 
 
+@pytest.fixture(scope='module')
+def alone(module_suite):
+    """Start nodes at once, each in a namespace of its own."""
+    return {namespace: module_suite.node(name, namespace=f'/{namespace}', fresh=True)
+            for namespace, name in (
+                ('alone_plant', 'plant'), ('alone_estimator', 'estimator'),
+                ('alone_controller', 'controller'), ('twice', 'controller'))}
+
+
 @pytest.mark.parametrize('name', ['plant', 'estimator', 'controller'])
-def test_node_alone_ends_as_soon_as_it_is_asked_to(suite, make_probe, name):
+def test_node_alone_ends_as_soon_as_it_is_asked_to(alone, make_probe, name):
     """Without anybody to talk to there is nothing to wait for."""
-    process = suite.node(name, namespace=f'/alone_{name}')
+    process = alone[f'alone_{name}']
     probe = make_probe(f'/alone_{name}')
     probe.diagnosis(f'alone_{name}/{name}')
     assert process.end(signal.SIGINT, SHUTDOWN_S) == 0
@@ -74,8 +84,8 @@ def test_node_alone_ends_as_soon_as_it_is_asked_to(suite, make_probe, name):
     assert process.stdout == '' or name == 'plant'
 
 
-def test_second_signal_does_no_harm(suite, make_probe):
-    process = suite.node('controller', namespace='/twice')
+def test_second_signal_does_no_harm(alone, make_probe):
+    process = alone['twice']
     make_probe('/twice').diagnosis('twice/controller')
     for _ in range(3):
         process.send(signal.SIGINT)
@@ -85,7 +95,7 @@ def test_second_signal_does_no_harm(suite, make_probe):
 
 def test_signal_during_the_start_is_no_outcry(suite, make_probe):
     """It ends, whether or not it was ready, and never with a traceback of ours."""
-    process = suite.node('plant', namespace='/early')
+    process = suite.node('plant', namespace='/early', fresh=True)
     make_probe().wait(lambda: process.stderr)
     process.send(signal.SIGINT)
     assert process.end(seconds=SHUTDOWN_S) == 0
@@ -108,27 +118,52 @@ sys.exit(main())
 """
 
 
+NAMES = ('plant', 'estimator', 'controller', 'record')
+
+
+@pytest.fixture(scope='module')
+def watched(domain, shared_memory, tmp_path_factory):
+    """
+    Run commands, all at once, until the middleware has made its threads, and stop them then.
+
+    :returns: what they printed by name and whether they follow simulated time.
+    """
+    started = {}
+    for number, (name, sim_time) in enumerate(product(NAMES, (False, True))):
+        arguments = ['--ros-args', '-r', f'__ns:=/watched_{number}',
+                     '-p', f'use_sim_time:={str(sim_time).lower()}']
+        if name == 'record':
+            arguments = ['-o', 'bag']
+        started[name, sim_time] = subprocess.Popen(
+            [sys.executable, '-c', WATCHED, name, *arguments],
+            cwd=tmp_path_factory.mktemp('watched'),
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    printed = {}
+    try:
+        for process in started.values():
+            # The middleware makes its threads before the node takes signals.
+            deadline = time.monotonic() + 20.0
+            threads = Path(f'/proc/{process.pid}/task')
+            while b'dds.' not in b''.join(
+                    path.read_bytes() for path in threads.glob('*/comm')):
+                assert process.poll() is None
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+            shared_memory.note(process.pid)
+            process.send_signal(signal.SIGINT)
+        for key, process in started.items():
+            printed[key], _ = process.communicate(timeout=20.0)
+    finally:
+        for process in started.values():
+            process.kill()
+            process.communicate()
+    return printed
+
+
 @pytest.mark.parametrize('sim_time', [False, True], ids=['', 'sim_time'])
-@pytest.mark.parametrize('name', ['plant', 'estimator', 'controller', 'record'])
-def test_nothing_of_the_middleware_is_left_to_the_end_of_the_process(
-        domain, shared_memory, tmp_path, name, sim_time):
+@pytest.mark.parametrize('name', NAMES)
+def test_nothing_of_the_middleware_is_left_to_the_end_of_the_process(watched, name, sim_time):
     """There it waits for its own callbacks, now and then for ever, at full speed."""
-    arguments = ['--ros-args', '-p', f'use_sim_time:={str(sim_time).lower()}']
-    if name == 'record':
-        arguments = ['-o', 'bag']
-    process = subprocess.Popen(
-        [sys.executable, '-c', WATCHED, name, *arguments], cwd=tmp_path,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    # The middleware makes its threads before the node takes signals.
-    deadline = time.monotonic() + 20.0
-    while b'dds.' not in b''.join(
-            path.read_bytes() for path in Path(f'/proc/{process.pid}/task').glob('*/comm')):
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    shared_memory.note(process.pid)
-    process.send_signal(signal.SIGINT)
-    out, _ = process.communicate(timeout=20.0)
-    line, = [line for line in out.splitlines() if line.startswith('threads')]
+    line, = [line for line in watched[name, sim_time].splitlines() if line.startswith('threads')]
     # This one belongs to the process.
     assert set(line.split()[1:]) <= {'dds.shm.wdog'}
