@@ -40,9 +40,10 @@ from fourbar_ros.analysis.independent.mujoco_model import MujocoLinkage, State, 
 from fourbar_ros.analysis.progress import Progress
 from fourbar_ros.configuration import share_directory
 from fourbar_ros.errors import FourbarError
+from fourbar_ros.estimation.filter import LinkageFilter
 from fourbar_ros.loop.run import make_loop
 from fourbar_ros.loop.scenario import load_scenario
-from fourbar_ros.mechanism import compiled, load_mechanism, Mechanism
+from fourbar_ros.mechanism import assemble, compiled, load_mechanism, Mechanism
 from fourbar_ros.mechanism.case import Case, load_case
 from fourbar_ros.mechanism.forces import NOTHING
 from fourbar_ros.mechanism.layout import (
@@ -86,6 +87,7 @@ PLANT_STEPS = 400
 PLANT_AWAY = InitialState(0.0, 1.0, 'open', 0.3, -0.2)
 PLANT_NEAR = InitialState(0.0, 0.04, 'open', 0.3, -0.1)
 PLANT_TORQUE = 5e-3
+FILTER_STEPS = 200
 LOOP_TICKS = 50
 
 # The right-hand side runs on its own results, by so little that the motion stays: nothing of it
@@ -117,6 +119,7 @@ QUANTITIES = (
     ('batch_steps_per_s', '1/s', 'steps of many linkages on all cores'),
     ('plant_step_ns', 'ns', 'one step of the plant, every effect on'),
     ('plant_step_near_alignment_ns', 'ns', 'one step of the plant, near alignment'),
+    ('estimator_step_ns', 'ns', 'one step of the filter, prediction and four gated angles'),
     ('closed_loop_times_real_time', '', 'closed loop without ROS, times real time'),
     ('mujoco_euler_step_ns', 'ns', 'one step of MuJoCo, Euler'),
     ('mujoco_rk4_step_ns', 'ns', 'one step of MuJoCo, RK4'),
@@ -200,7 +203,8 @@ def measure(repeats: int, progress: Progress) -> dict[str, Any]:
     rivals = {'rhs_ns': _right_hand_sides(away), 'rk4_step_ns': _steps(away, STEPS),
               'rk4_step_near_alignment_ns': _steps(near, NEAR_STEPS), 'batch': _batch(away),
               'plant_step_ns': _plant_steps(PLANT_AWAY),
-              'plant_step_near_alignment_ns': _plant_steps(PLANT_NEAR), 'loop': _loop_ticks()}
+              'plant_step_near_alignment_ns': _plant_steps(PLANT_NEAR),
+              'estimator_step_ns': _filter_steps(), 'loop': _loop_ticks()}
     if with_mujoco:
         rivals |= _mujoco_rivals(away)
     results |= _race(rivals, stages)
@@ -225,6 +229,7 @@ def checks_of(results: Mapping[str, Any]) -> list[Check]:
         at_most('plant_step_ns', _number(results, 'plant_step_ns'), 'ns', 3000.0),
         at_most('plant_step_near_alignment_ns',
                 _number(results, 'plant_step_near_alignment_ns'), 'ns', 6000.0),
+        at_most('estimator_step_ns', _number(results, 'estimator_step_ns'), 'ns', 60000.0),
         at_least('closed_loop_times_real_time',
                  _number(results, 'closed_loop_times_real_time'), '', 15.0),
         at_most('import_to_first_step_s', _number(results, 'import_to_first_step_s'), 's', 1.0),
@@ -406,6 +411,23 @@ def _plant_steps(initial: InitialState) -> Rival:
         plant.disturb(scenario.plant.step)
 
     return Rival(begin, lambda: plant.advance(PLANT_STEPS, torques), PLANT_STEPS)
+
+
+def _filter_steps() -> Rival:
+    """Predict over a period and correct with four angles, each gated, again and again."""
+    scenario = load_scenario(SCENARIO)
+    settings, period_s = scenario.estimator, scenario.plant.period_ns * 1e-9
+    angles = assemble(scenario.mechanism, scenario.initial.link_a, scenario.initial.link_b)
+    linkage = LinkageFilter(
+        scenario.mechanism, angles, settings.angle_variance, 1e-4, settings.randomness)
+    torques, variances = np.zeros(4), settings.variances[:4]
+
+    def run() -> None:
+        for _ in range(FILTER_STEPS):
+            linkage.move(period_s, torques)
+            linkage.correct((0, 1, 2, 3), linkage.angles, variances, settings.gate)
+
+    return Rival(lambda: None, run, FILTER_STEPS)
 
 
 def _loop_ticks() -> Rival:

@@ -129,11 +129,10 @@ class _Memory(NamedTuple):
 
 
 class _Wheels(NamedTuple):
-    """What is known of the wheels at a tick: mean speeds over the period, and at its end."""
+    """Speeds of the wheels: mean over the period before a tick, and at its end."""
 
-    stamp_ns: int
-    speeds: Array | None
-    last: Array | None
+    mean: Array
+    last: Array
 
 
 class Estimator:
@@ -346,19 +345,17 @@ class Estimator:
         :returns: (4,) If dOmega/dt relative to the links [N m]; density of a random walk
             [N m/sqrt(s)], 0 where it was measured.
         """
-        before, elapsed = self._wheels, 0.0 if last_ns is None else (stamp_ns - last_ns) * 1e-9
-        last = None
+        before, self._wheels = self._wheels, None
         if speeds.size:
-            last = speeds
-            if before is not None and before.speeds is not None:
-                # A mean over the period is the speed in its middle: half a period on.
-                last = speeds + 0.5 * (speeds - before.speeds)
-        self._wheels = _Wheels(stamp_ns, speeds if speeds.size else None, last)
+            # A mean over the period is the speed in its middle: half a period on.
+            last = speeds + 0.5 * (speeds - before.mean) if before is not None else speeds
+            self._wheels = _Wheels(speeds, last)
         if last_ns is None:
             return np.zeros(4), 0.0
-        if last is not None and before is not None and before.last is not None:
+        if self._wheels is not None and before is not None:
             self.driven_by = BY_SPEED
-            return self._inertias * (last - before.last) / elapsed, 0.0
+            elapsed = (stamp_ns - last_ns) * 1e-9
+            return self._inertias * (self._wheels.last - before.last) / elapsed, 0.0
         given: Array | None = efforts if efforts.size else self._commanded
         if given is None:
             self.driven_by = BY_NOTHING

@@ -51,7 +51,7 @@ class EstimatorNode(Node):
             load_mechanism(values.pop('mechanism')), EstimatorSettings(**values))
         self._estimator = self._topics.estimator
         self._log, self._rejected = RareLog(self), Recently()
-        self._listens_to_commands = False
+        self._listens_to_commands, self._starts = False, 0
         self._outputs = {
             topic: JointStatePublisher(self, topic, output.names, output.fields, output.frame)
             for topic, output in OUTPUTS.items()}
@@ -76,11 +76,19 @@ class EstimatorNode(Node):
         for published in answer.messages:
             self._publish(published)
         if answer.messages and not answer.rejection:
+            self._tell_starts()
             self._diagnostics.changed()
             if self._topics.needs_commands and not self._listens_to_commands:
                 # Only here: these messages cost time at every tick.
                 self._listens_to_commands = True
                 self._listen(COMMAND)
+
+    def _tell_starts(self):
+        starts = self._estimator.starts
+        if starts != self._starts:
+            self._starts = starts
+            self.get_logger().info(
+                'started' if starts == 1 else f'acquired the linkage anew, start {starts}')
 
     def _publish(self, message):
         if message.topic == WAITING:

@@ -28,7 +28,7 @@ needs_mujoco = pytest.mark.skipif(find_spec('mujoco') is None, reason='mujoco is
 
 OURS = ('rhs_ns', 'rk4_step_ns', 'rk4_step_near_alignment_ns', 'batch_steps_per_s', 'error_rad',
         'import_to_first_step_s', 'plant_step_ns', 'plant_step_near_alignment_ns',
-        'closed_loop_times_real_time')
+        'closed_loop_times_real_time', 'estimator_step_ns')
 BESIDE_MUJOCO = (
     'mujoco_euler_step_ns', 'mujoco_rk4_step_ns', 'mujoco_euler_lean_step_ns',
     'mujoco_rk4_lean_step_ns', 'ratio_vs_mujoco_euler', 'ratio_vs_mujoco_rk4',
@@ -42,7 +42,8 @@ GOOD = {
     'smallest_sine': 0.9, 'near_alignment_largest_sine': 0.05, 'mujoco_euler_step_ns': 5000.0,
     'mujoco_rk4_step_ns': 20000.0, 'ratio_vs_mujoco_euler': 12.5, 'ratio_vs_mujoco_rk4': 50.0,
     'plant_step_ns': 2000.0, 'plant_step_near_alignment_ns': 4000.0,
-    'closed_loop_times_real_time': 30.0, 'cores': 2, 'cpu': 'a quick one',
+    'closed_loop_times_real_time': 30.0, 'estimator_step_ns': 2e4,
+    'cores': 2, 'cpu': 'a quick one',
     'load_average_1min': 0.0, 'versions': {'python': '3'},
     'linkage': 'asymmetric', 'step_s': 1e-3, 'torque_sampling': 'held', 'statistic': 'least',
     'skipped': []}
@@ -130,6 +131,7 @@ def test_without_mujoco_the_rest_is_measured(
     ({'plant_step_ns': 3001.0}, 1),
     ({'plant_step_near_alignment_ns': 6001.0}, 1),
     ({'closed_loop_times_real_time': 14.9}, 1),
+    ({'estimator_step_ns': 60001.0}, 1),
     ({'ratio_vs_mujoco_euler': 7.9}, 1),
     ({'ratio_vs_mujoco_rk4': 29.9}, 1),
     ({'near_alignment_largest_sine': 0.2}, 1),

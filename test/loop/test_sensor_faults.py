@@ -1,0 +1,117 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Sensors fail during a manoeuvre of the prototype: the estimate stands it, and names them."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from math import inf, pi, radians
+
+from fourbar_ros.control import ControllerSettings
+from fourbar_ros.loop.closed_loop import ClosedLoop, Step
+from fourbar_ros.loop.run import make_loop
+from fourbar_ros.loop.scenario import load_scenario, Scenario
+from fourbar_ros.mechanism import LINK_NAMES
+from fourbar_ros.plant import Fault
+import numpy as np
+import pytest
+
+PERIOD_S = 4e-3
+SETPOINT_S, FASTEST_S, END_S = 1.0, 3.0, 5.5
+# No error of an angle beyond this, whatever one sensor does.
+LARGEST_ERROR = radians(1.0)
+NAMED_WITHIN_S = 2.0
+
+FAULTS = [('off', None), ('stuck', None), ('garbage', None), ('wrong', 0.1),
+          ('wrong', radians(-0.35)), ('slow', 0.2), ('delayed', 0.1), ('delayed', 0.03),
+          ('intermittent', 0.5)]
+
+
+@pytest.fixture(scope='module')
+def scenario() -> Scenario:
+    return load_scenario('prototype')
+
+
+def quarter_turn(loop: ClosedLoop) -> Iterator[tuple[float, Step]]:
+    """Go through a quarter turn of both pairs in 4 s, fastest in the middle."""
+    loop.controller.settings = ControllerSettings(setpoint_duration=4.0)
+    for tick in range(round(END_S / PERIOD_S)):
+        step = loop.step()
+        if tick == 125:
+            assert loop.arm()[0]
+        if tick == round(SETPOINT_S / PERIOD_S):
+            assert step.estimate is not None
+            loop.controller.setpoint(
+                LINK_NAMES[:2], list(step.estimate.link_angles[:2] + pi / 2.0),
+                step.samples.stamp_ns)
+        yield tick * PERIOD_S, step
+
+
+def error_of(step: Step) -> float:
+    """Return the largest error of an angle, infinite without an estimate [rad]."""
+    if step.estimate is None or step.samples.truth is None:
+        return inf
+    return float(np.abs(step.estimate.link_angles - step.samples.truth.link_angles).max())
+
+
+@pytest.mark.parametrize('link', range(4))
+@pytest.mark.parametrize(('kind', 'value'), FAULTS)
+def test_one_that_fails_does_little_and_is_named(
+    kind: str, value: float | None, link: int, scenario: Scenario,
+) -> None:
+    """In the fastest moment, and only it."""
+    name = LINK_NAMES[link]
+    loop = make_loop(replace(scenario, seed=10 + link))
+    named_s, worst = inf, 0.0
+    for now_s, step in quarter_turn(loop):
+        if now_s == FASTEST_S:
+            loop.testbed.device.break_down(name, Fault(name, kind, value))
+        named = loop.estimator.sensor_faults()
+        if now_s > 0.5:
+            worst = max(worst, error_of(step))
+        if named_s == inf and list(named) == [name]:
+            named_s = now_s - FASTEST_S
+        if now_s < FASTEST_S:
+            assert named == {}
+        else:
+            assert not named or name in named
+    assert named_s < NAMED_WITHIN_S
+    assert worst < LARGEST_ERROR
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_wheels_alone_carry_it_for_a_second_and_then_it_says_that_it_is_lost(
+    seed: int, scenario: Scenario,
+) -> None:
+    loop = make_loop(replace(scenario, seed=seed))
+    lost_s = inf
+    for now_s, step in quarter_turn(loop):
+        if now_s == FASTEST_S:
+            for name in LINK_NAMES:
+                loop.testbed.device.break_down(name, Fault(name, 'off'))
+        if 0.5 < now_s < FASTEST_S + 1.0:
+            assert error_of(step) < LARGEST_ERROR, f'seed {seed}'
+        if lost_s == inf and now_s > FASTEST_S and step.estimate is None:
+            lost_s = now_s - FASTEST_S
+            assert 'lost' in loop.estimator.waiting_for
+    assert 1.0 <= lost_s < 1.1
+    assert not loop.testbed.gate.armed
+
+
+def test_nobody_is_named_without_reason(scenario: Scenario) -> None:
+    """Fault-free, nobody is named; the campaign of a hundred runs is `study consistency`."""
+    for seed in range(3):
+        loop = make_loop(replace(scenario, seed=100 + seed))
+        for _ in quarter_turn(loop):
+            assert loop.estimator.sensor_faults() == {}, f'seed {seed}'
