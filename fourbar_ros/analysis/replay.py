@@ -36,6 +36,7 @@ from fourbar_ros.errors import FourbarError
 from fourbar_ros.estimation import EstimatorSettings
 from fourbar_ros.estimation.parameters import PARAMETERS
 from fourbar_ros.estimation.topics import (
+    COMMAND,
     EstimatorTopics,
     INNOVATION,
     INPUTS,
@@ -252,7 +253,7 @@ def find_namespace(stored: StoredBag, wanted: str | None = None) -> str:
             raise BagError(f'{stored.path}: no topic {topic}: {_what_it_has(topics)}')
         if not any(counts):
             raise BagError(f'{stored.path}: no message on {topic}')
-    for name in (*INPUTS, STATES, INNOVATION, TRUTH):
+    for name in (*INPUTS, COMMAND, STATES, INNOVATION, TRUTH):
         kind = topics.get(f'{chosen}/{name}', JOINT_STATE)
         if kind != JOINT_STATE:
             raise BagError(f'{stored.path}: {chosen}/{name} is {kind}, not {JOINT_STATE}')
@@ -294,7 +295,7 @@ class _Run:
         self._topics = topics
         self._namespace = namespace
         self._relative = {f'{namespace}/{name}': name for name in (
-            *INPUTS, *OUTPUTS, WAITING, TRUTH)}
+            *INPUTS, COMMAND, *OUTPUTS, WAITING, TRUTH)}
         self._faults: Counter[str] = Counter()
         self._seen_faults: dict[str, float | None] = {}
 
@@ -314,7 +315,8 @@ class _Run:
                 writer.write(copy(connection), logged_ns, data)
             if connection.topic == DIAGNOSTICS and connection.msgtype == DIAGNOSTIC_ARRAY:
                 self._diagnosed(self._stored.content(connection, data))
-            elif name in (*INPUTS, STATES, INNOVATION, TRUTH):
+            elif name in (*INPUTS, STATES, INNOVATION, TRUTH) or (
+                    name == COMMAND and self._topics.needs_commands):
                 for answer in self._take(name, self._stored.content(connection, data)):
                     publish(answer, logged_ns)
         self._conclude()
@@ -385,18 +387,26 @@ class _Publisher:
 
         self._writer = writer
         self._store = get_typestore(Stores.ROS2_JAZZY)
-        self._connections = {}
+        self._namespace = namespace
+        self._connections: dict[str, Any] = {}
         # As they were offered to the recorder.
-        offered: dict[str, Any] = {connection.topic: connection.ext for connection in recorded}
+        self._offered: dict[str, Any] = {
+            connection.topic: connection.ext for connection in recorded}
         for name in (*OUTPUTS, WAITING):
-            topic = f'{namespace}/{name}'
-            profiles = offered[topic].offered_qos_profiles if topic in offered else ()
-            self._connections[name] = writer.add_connection(
-                topic, HEADER if name == WAITING else JOINT_STATE, typestore=self._store,
-                offered_qos_profiles=profiles)
+            if name == WAITING or not OUTPUTS[name].optional:
+                self._offer(name)
+
+    def _offer(self, name: str) -> None:
+        topic, offered = f'{self._namespace}/{name}', self._offered
+        profiles = offered[topic].offered_qos_profiles if topic in offered else ()
+        self._connections[name] = self._writer.add_connection(
+            topic, HEADER if name == WAITING else JOINT_STATE, typestore=self._store,
+            offered_qos_profiles=profiles)
 
     def __call__(self, message: Message, logged_ns: int) -> None:
         """Write one message."""
+        if message.topic not in self._connections:
+            self._offer(message.topic)
         types = self._store.types
         sec, nanosec = divmod(message.stamp_ns, 1_000_000_000)
         stamp = types['builtin_interfaces/msg/Time'](sec=sec, nanosec=nanosec)

@@ -52,11 +52,13 @@ class Output(NamedTuple):
     :param names: in their order; a message may leave some out, or carry others.
     :param fields: those of position, velocity, effort that are used.
     :param frame: in which orientations are given, or ''.
+    :param optional: whether it is there only once there is something to say.
     """
 
     names: tuple[str, ...]
     fields: tuple[str, ...] = ('position', 'velocity')
     frame: str = ''
+    optional: bool = False
 
 
 STATES, INNOVATION = 'estimate/link_states', 'estimate/innovation'
@@ -65,7 +67,7 @@ OUTPUTS = {
     'estimate/sigma': Output(LINK_NAMES),
     'estimate/covariance': Output(COVARIANCES, ('position',)),
     'estimate/disturbance': Output(DISTURBANCES, ('position',)),
-    'estimate/gyro_bias': Output(LINK_NAMES, ('velocity',)),
+    'estimate/gyro_bias': Output(LINK_NAMES, ('velocity',), optional=True),
     'estimate/decisions': Output(LINK_NAMES, ('position', 'velocity', 'effort')),
     INNOVATION: Output(('nis', 'degrees_of_freedom', *LINK_NAMES), ('position',)),
 }

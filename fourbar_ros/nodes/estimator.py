@@ -52,14 +52,20 @@ class EstimatorNode(Node):
         self._estimator = self._topics.estimator
         self._log, self._rejected = RareLog(self), Recently()
         self._listens_to_commands, self._starts = False, 0
-        self._outputs = {
-            topic: JointStatePublisher(self, topic, output.names, output.fields, output.frame)
-            for topic, output in OUTPUTS.items()}
+        self._outputs = {}
+        for topic, output in OUTPUTS.items():
+            if not output.optional:
+                self._offer(topic)
         self._waiting = self.create_publisher(Header, WAITING, RELIABLE)
         self.create_service(Trigger, 'estimate/reset', runtime.guard(self._on_reset))
         self._diagnostics = Diagnostics(self, '', self._collect, runtime.guard)
         for topic in INPUTS:
             self._listen(topic)
+
+    def _offer(self, topic):
+        output = OUTPUTS[topic]
+        self._outputs[topic] = JointStatePublisher(
+            self, topic, output.names, output.fields, output.frame)
 
     def _listen(self, topic):
         self.create_subscription(JointState, topic, self._runtime.guard(
@@ -96,6 +102,8 @@ class EstimatorNode(Node):
             stamp.stamp.sec, stamp.stamp.nanosec = divmod(message.stamp_ns, 1_000_000_000)
             self._waiting.publish(stamp)
             return
+        if message.topic not in self._outputs:
+            self._offer(message.topic)
         self._outputs[message.topic].publish(
             message.stamp_ns, *message.values, names=message.names)
 

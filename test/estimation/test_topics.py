@@ -101,3 +101,24 @@ def test_what_is_of_no_use_is_told(topics: EstimatorTopics, topic: str) -> None:
     # A tick is answered all the same: a lock-step waits for it.
     assert [message.topic for message in answer.messages] == (
         ['estimate/waiting'] if topic == 'flywheel_states' else [])
+
+
+def test_commands_stand_in_where_ticks_say_nothing_of_the_wheels(topics: EstimatorTopics) -> None:
+    def silent_tick(number: int) -> None:
+        topics.receive('flywheel_states', number * TICK_NS, FLYWHEEL_NAMES, [], [], [])
+    sample(topics, 1)
+    tick(topics, 1)
+    tick(topics, 2)
+    assert not topics.needs_commands
+    silent_tick(3)
+    assert topics.needs_commands
+    assert topics.receive('flywheel_command', 3 * TICK_NS, FLYWHEEL_NAMES, [], [], [1e-6] * 4
+                          ) == Answer()
+    silent_tick(4)
+    assert topics.estimator.driven_by == 'commanded efforts'
+    assert topics.needs_commands
+    # A command of other wheels, or of speeds, is no help.
+    topics.receive('flywheel_command', 4 * TICK_NS, ['flywheel_x'], [], [], [1.0])
+    topics.receive('flywheel_command', 4 * TICK_NS, FLYWHEEL_NAMES, [], [1.0] * 4, [])
+    silent_tick(5)
+    assert topics.estimator.driven_by == 'commanded efforts'

@@ -48,6 +48,8 @@ JOINT_STATES = {
             'phi_a.phi_a', 'phi_a.phi_b', 'phi_a.omega_a', 'phi_a.omega_b', 'phi_b.phi_b',
             'phi_b.omega_a', 'phi_b.omega_b', 'omega_a.omega_a', 'omega_a.omega_b',
             'omega_b.omega_b'], ('position',)),
+        'estimate/disturbance': (['torque_a', 'torque_b', 'sigma_a', 'sigma_b'], ('position',)),
+        'estimate/decisions': (LINKS, ALL),
         'estimate/innovation': (['nis', 'degrees_of_freedom', *LINKS], ('position',)),
     },
     'controller': {
