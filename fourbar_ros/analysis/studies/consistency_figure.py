@@ -63,6 +63,10 @@ def _draw(outcomes: dict[str, Outcome]) -> Figure:
                 outcomes.get('matched_encoders') if name == 'matched' else None)
         _whiteness(axes[4], outcome)
     style.log_ticks(panels[0, 0])
+    for row in (1, 4):
+        # Room for the legend.
+        low, high = panels[row, 0].get_ylim()
+        panels[row, 0].set_ylim(low, high + 0.25 * (high - low))
     for row, columns in ((2, slice(0, 2)), (3, slice(2, 4))):
         style.log_ticks(panels[row, 0])
         # The first steps, which know next to nothing, would take all the room.
@@ -73,8 +77,8 @@ def _draw(outcomes: dict[str, Outcome]) -> Figure:
         panels[row, 0].set_ylabel(text)
         for axes in panels[row]:
             axes.set_xlabel('lag [measurements]' if row == 4 else 'time [s]')
-        panels[row, 0].legend(loc='upper right', ncols=1 if row in (2, 3) else 2,
-                              borderaxespad=0.1, columnspacing=1.0, handletextpad=0.5)
+        panels[row, 0].legend(loc='upper right', ncols=(2, 2, 1, 1, 3)[row], borderaxespad=0.1,
+                              columnspacing=1.0, handletextpad=0.5)
     return figure
 
 
@@ -89,13 +93,13 @@ def _statistic(axes: Axes, times: Array, values: Array, low: Array, high: Array,
 
 def _errors(axes: Axes, outcome: Outcome, columns: tuple[int, int], rounded: Outcome | None
             ) -> None:
-    for column, colour in zip(columns, LINK_COLOURS):
-        axes.plot(*style.decimate(outcome.times, _degrees(outcome.mean_squares[:, column]), BINS),
-                  color=colour, linewidth=0.8, label=STATE_NAMES[column])
     if rounded is not None:
         axes.plot(*style.decimate(rounded.times, _degrees(rounded.mean_squares[:, columns[0]]),
                                   BINS), color=LINK_COLOURS[2], linewidth=0.8,
                   label=f'{STATE_NAMES[columns[0]]}, 14-bit encoders')
+    for column, colour in zip(columns, LINK_COLOURS):
+        axes.plot(*style.decimate(outcome.times, _degrees(outcome.mean_squares[:, column]), BINS),
+                  color=colour, linewidth=0.8, label=STATE_NAMES[column])
     axes.plot(*style.decimate(outcome.times, _degrees(outcome.bound[:, columns[0]]), BINS),
               color=COLOURS['limit'], linestyle=DASHED, linewidth=1.2, label='Cramer-Rao bound')
 
