@@ -54,7 +54,7 @@ COMMANDS = {
     'demo': 'the whole loop, from start to report',
     'simulate': 'integrate one motion, without ROS',
     'bench': 'time the mechanics beside MuJoCo',
-    'study': 'rerun a study of the paper',
+    'study': 'rerun a study and check what it finds',
 }
 
 # Commands that share a module; the others have one of their own name.

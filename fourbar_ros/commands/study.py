@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""`fourbar study`: rerun a study of the paper and check what comes out."""
+"""`fourbar study`: run a study and check what comes out."""
 
 from __future__ import annotations
 
@@ -37,6 +37,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--json', metavar='FILE', type=Path,
         help='checks and numbers, units in their names (also in FOLDER as NAME.json)')
+    drawn = parser.add_argument_group('studies that draw at random')
+    drawn.add_argument('--runs', metavar='N', type=int,
+                       help='runs of each kind (default 100, for which the limits are made)')
+    drawn.add_argument('--seed', metavar='S', type=int,
+                       help='of the first run of each kind, the others follow it (default 0)')
+    drawn.add_argument('--jobs', metavar='N', type=int,
+                       help='processes, which change nothing but the time (default all cores)')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,7 +53,9 @@ def run(args: argparse.Namespace) -> int:
     from fourbar_ros.commands.progress import show_progress
     from fourbar_ros.mechanism.compiled import announced
 
-    study = load_study(args.name)
+    sample = {name: value for name in ('runs', 'seed', 'jobs')
+              if (value := getattr(args, name)) is not None}
+    study = load_study(args.name, **sample)
     # Before the work, not after it.
     folder = args.output or Path(f'study_{args.name}')
     try:

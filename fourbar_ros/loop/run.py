@@ -50,17 +50,18 @@ def make_loop(scenario: Scenario) -> ClosedLoop:
                       Controller(scenario.mechanism, scenario.controller))
 
 
-def run_scenario(scenario: Scenario) -> Iterator[Step]:
+def run_scenario(scenario: Scenario, loop: ClosedLoop | None = None) -> Iterator[Step]:
     """
     Go through a scenario tick by tick.
 
     What the script does at a time happens right after the first tick at or after it, and acts
     from the next tick on.
 
+    :param loop: what `make_loop` made of it, for a caller who wants to look inside.
     :raises RunError: the device refused to be armed, or the controller a setpoint.
     :raises FourbarError: the device failed.
     """
-    loop = make_loop(scenario)
+    loop = make_loop(scenario) if loop is None else loop
     waiting = list(scenario.setpoints)
     for tick in range(scenario.ticks):
         step = loop.step()

@@ -59,6 +59,10 @@ GRAVITY = 9.80665
 # limit for Runge-Kutta of order four is 2.8, here with a margin for other poses).
 STIFFEST = 1.0
 
+# Torques that walk are at the first draw as if they had walked for so long [s]: what an estimator
+# believes of them that has seen nothing yet.
+WALKED_BEFORE = 10.0
+
 # Relative rates in joints 1 to 4, from the rates of the links.
 RELATIVE = np.array([[-1, 1, 0, 0], [0, -1, 1, 0], [0, 0, -1, 1], [1, 0, 0, -1]], dtype=float)
 
@@ -94,6 +98,8 @@ class Truth:
     :param wheel_angles: (4,) relative to the link, unwrapped [rad].
     :param wheel_speeds: (4,) relative to the link [rad/s].
     :param efforts: (4,) torque of each motor, mean over the last control period [N m].
+    :param walked_torques: (2,) the random torques on links a and b that walk, as they were in
+        that period [N m].
     :param centre_position: (2,) of the mass centre of the whole, in frame `table` [m].
     :param centre_velocity: (2,) [m/s].
     :param base_position: (2,) of joint 1, the origin of the frame of link a [m].
@@ -105,6 +111,7 @@ class Truth:
     wheel_angles: Array
     wheel_speeds: Array
     efforts: Array
+    walked_torques: Array
     centre_position: Array
     centre_velocity: Array
     base_position: Array
@@ -148,7 +155,9 @@ class Plant:
             stribeck_rate=table.joints.stribeck_rate, smoothing=table.joints.smoothing,
             link_drag=table.links.drag, link_spin_drag=table.links.spin_drag,
             gravity=GRAVITY * np.array([sin(surface.tilt_x), sin(surface.tilt_y)]))])
-        self._around['acting'] |= table.disturbance.torque_density > 0.0
+        self._around['acting'] |= table.disturbance.acting
+        self._walked = np.zeros(2)
+        self._walked_for: float | None = None
         self.efforts = np.zeros(4)
         self.reset(initial)
         self._check_friction()
@@ -221,10 +230,19 @@ class Plant:
 
         :param duration_s: for how long they are going to be held [s].
         """
-        density = self._table.disturbance.torque_density
-        if density:
-            self._around['link_torques'][0] = self._generator.standard_normal(4) * (
-                density / np.sqrt(duration_s))
+        disturbance = self._table.disturbance
+        torques = np.zeros(4)
+        if disturbance.torque_density:
+            torques = self._generator.standard_normal(4) * (
+                disturbance.torque_density / np.sqrt(duration_s))
+        if disturbance.torque_walk:
+            elapsed = WALKED_BEFORE if self._walked_for is None else self._walked_for
+            self._walked = self._walked + self._generator.standard_normal(2) * (
+                disturbance.torque_walk * np.sqrt(elapsed))
+            self._walked_for = duration_s
+            torques[:2] += self._walked
+        if disturbance.acting:
+            self._around['link_torques'][0] = torques
 
     def advance(self, steps: int, commands: Array, by_speed: ArrayLike = False,
                 conditions: Boxed = SOUND) -> None:
@@ -265,7 +283,7 @@ class Plant:
         return Truth(
             state[LINK_ANGLES], state[LINK_RATES], state[WHEEL_ANGLES],
             state[WHEEL_SPEEDS] - state[LINK_RATES],
-            self.efforts.copy() if efforts is None else efforts,
+            self.efforts.copy() if efforts is None else efforts, self._walked.copy(),
             state[CENTRE_POSITION], state[CENTRE_VELOCITY], base[:2], base[2:])
 
     @property

@@ -144,16 +144,24 @@ class Surface:
 @dataclass(frozen=True)
 class Disturbance:
     """
-    Random torques on the links, white noise held over each control period.
+    Random torques on the links, held over each control period.
 
-    :param torque_density: of the torque on each link [N m/sqrt(Hz)].
+    :param torque_density: of white noise on each link [N m/sqrt(Hz)].
+    :param torque_walk: of a random walk on links a and b, beside it [N m/sqrt(s)].
     """
 
     torque_density: float = 0.0
+    torque_walk: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse what is no density."""
         _check('disturbance.torque_density', self.torque_density)
+        _check('disturbance.torque_walk', self.torque_walk)
+
+    @property
+    def acting(self) -> bool:
+        """Whether there is any."""
+        return self.torque_density > 0.0 or self.torque_walk > 0.0
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@
 
 from collections.abc import Callable, Iterable
 import csv
+from dataclasses import replace
 import json
 import math
 from pathlib import Path
@@ -25,7 +26,7 @@ from typing import Any
 
 from fourbar_ros.analysis import studies
 from fourbar_ros.analysis.checks import at_most
-from fourbar_ros.analysis.studies import Progress, Result, validation
+from fourbar_ros.analysis.studies import consistency, Progress, Result, validation
 from fourbar_ros.commands.main import main
 import pytest
 
@@ -84,6 +85,38 @@ def test_validation_keeps_its_checks_and_writes_what_it_found(
         assert row['motion'] in out
 
 
+def test_consistency_is_the_same_whatever_the_number_of_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Two kinds, three runs each of 0.6 s; too few for the limits, which is told as well."""
+    pytest.importorskip('matplotlib')
+    kinds = [replace(case, scenario=replace(case.scenario, duration=0.6))
+             for case in consistency.cases() if case.name in ('matched', 'prototype')]
+    monkeypatch.setattr(consistency, 'cases', lambda: kinds)
+    monkeypatch.setattr(consistency, 'SETTLED_AT', 0.3)
+    outputs = []
+    for jobs in ('1', '2'):
+        folder = tmp_path / jobs
+        code = main(['study', 'consistency', '--runs', '3', '--seed', '5', '--jobs', jobs,
+                     '-o', str(folder)])
+        outputs.append(capsys.readouterr().out.replace(str(folder), ''))
+        document = json.loads((folder / 'consistency.json').read_text())
+        assert code == (0 if all(check['passed'] for check in document['checks']) else 1)
+    assert outputs[0] == outputs[1]
+    for name in ('consistency.json', 'consistency.csv'):
+        assert (tmp_path / '1' / name).read_bytes() == (tmp_path / '2' / name).read_bytes()
+    assert (document['runs'], document['seed'], document['skipped']) == (3, 5, [])
+    assert set(document['cases']) == {'matched', 'prototype'}
+    assert all(math.isfinite(check['value']) for check in document['checks'])
+    assert len({check['name'] for check in document['checks']}) == len(document['checks'])
+    png = (folder / 'consistency.png').read_bytes()
+    assert png.startswith(b'\x89PNG')
+    with (folder / 'consistency.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * kinds[0].scenario.ticks
+    assert float(rows[100]['nees_low']) < 4.0 < float(rows[100]['nees_high'])
+
+
 @pytest.mark.parametrize(('value', 'code', 'word'), [
     (1.0, 0, 'ok'), (2.0, 1, 'MISSED'), (math.nan, 1, 'MISSED')])
 def test_a_missed_check_is_exit_code_1(
@@ -127,7 +160,12 @@ def test_progress_does_not_change_what_it_shows(stub: Stub, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(('arguments', 'complaint'), [
-    (['atlantis'], "no study 'atlantis' (known are validation)"),
+    (['atlantis'], "no study 'atlantis' (known are validation, consistency)"),
+    (['consistency', '--runs', '0'], '--runs must be from 1 to 1000000, got 0'),
+    (['consistency', '--jobs', '0'], '--jobs must be from 1 to 1024, got 0'),
+    (['consistency', '--seed', '-1'], '--seed must be from 0 to'),
+    (['validation', '--runs', '5', '--seed', '1'],
+     'study validation draws nothing at random: it takes no --runs, --seed'),
     (['validation', '-o', 'file/folder'], 'cannot make file/folder'),
     (['validation', '--json', 'nowhere/v.json'], 'cannot write nowhere/v.json'),
 ])

@@ -22,6 +22,7 @@ from fourbar_ros.mechanism.layout import LINK_RATES
 from fourbar_ros.mechanism.totals import joint_gaps, linear_momentum, total_angular_momentum
 from fourbar_ros.plant import InitialState, load_table, Plant, PlantError, Table
 from fourbar_ros.plant.edge import joint_levers
+from fourbar_ros.plant.plant import WALKED_BEFORE
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import (
     Disturbance,
@@ -48,7 +49,7 @@ EFFECTS = {
     'drag': {'links': Links(0.01, 1.25e-4)},
     'tilt': {'surface': Surface(tilt_x=1e-3, tilt_y=-2e-3)},
     'edge': {'surface': Surface(size_x=0.5, size_y=0.45, restitution=0.6)},
-    'disturbance': {'disturbance': Disturbance(1e-4)},
+    'disturbance': {'disturbance': Disturbance(1e-4, 2e-4)},
 }
 EFFECTS['all'] = {
     **{name: section for effect in EFFECTS.values() for name, section in effect.items()},
@@ -139,7 +140,7 @@ def test_disturbances_are_white_torques_of_the_density_asked_for(
 ) -> None:
     """Seed 0; variance of the angular momentum = 4 links density^2 time, four standard errors."""
     density, runs = 1e-4, 400
-    plant = make_plant(prototype, table=with_effect('disturbance'))
+    plant = make_plant(prototype, table=Table(**SENSORS, disturbance=Disturbance(density)))
     gained = []
     for _ in range(runs):
         before = plant.ledger().disturbance_spin
@@ -149,6 +150,53 @@ def test_disturbances_are_white_torques_of_the_density_asked_for(
         gained.append(plant.ledger().disturbance_spin - before)
     variance = np.mean(np.square(gained)) / (4.0 * density**2 * 5 * 8 * 5e-4)
     assert abs(variance - 1.0) < 4.0 * np.sqrt(2.0 / runs)
+
+
+def test_disturbances_walk_with_the_density_asked_for(
+    prototype: Mechanism, make_plant: MakePlant,
+) -> None:
+    """
+    Seed 0; increments and, seeds 0 to 199, where the walk begins, within four standard errors.
+
+    What the walking torques give the links is what they say of themselves.
+    """
+    density, draws, period = 2e-4, 1000, 4e-3
+    table = Table(**SENSORS, disturbance=Disturbance(torque_walk=density))
+    plant = make_plant(prototype, table=table)
+    torques, spin = [], []
+    for _ in range(draws):
+        plant.disturb(period)
+        plant.advance(8, np.zeros(4))
+        torques.append(plant.truth().walked_torques)
+        spin.append(plant.ledger().disturbance_spin)
+    np.testing.assert_allclose(spin, period * np.cumsum(np.sum(torques, axis=1)), rtol=1e-9)
+    steps = np.diff(torques, axis=0) / (density * np.sqrt(period))
+    assert np.abs((steps ** 2).mean(axis=0) - 1.0).max() < 4.0 * np.sqrt(2.0 / draws)
+    assert abs((steps[:, 0] * steps[:, 1]).mean()) < 4.0 / np.sqrt(draws)
+
+    begins = []
+    for seed in range(200):
+        plant = make_plant(prototype, table=table, seed=seed)
+        plant.disturb(period)
+        begins.append(plant.truth().walked_torques / (density * np.sqrt(WALKED_BEFORE)))
+    assert abs(np.square(begins).mean() - 1.0) < 4.0 * np.sqrt(2.0 / 400)
+
+
+def test_walk_is_drawn_after_the_white_torques_and_goes_on_over_a_reset(
+    prototype: Mechanism, make_plant: MakePlant,
+) -> None:
+    """Without it a table draws what it always drew; a linkage put back finds it where it was."""
+    white, both = (make_plant(prototype, table=Table(**SENSORS, disturbance=made)) for made in (
+        Disturbance(1e-4), Disturbance(1e-4, 2e-4)))
+    for plant in (white, both):
+        plant.disturb(4e-3)
+        plant.advance(8, np.zeros(4))
+    assert white.truth().walked_torques.tolist() == [0.0, 0.0]
+    walked = both.truth().walked_torques
+    assert both.ledger().disturbance_spin - white.ledger().disturbance_spin == pytest.approx(
+        4e-3 * walked.sum(), rel=1e-9)
+    both.reset(MOVING)
+    assert both.truth().walked_torques.tolist() == walked.tolist()
 
 
 @pytest.mark.parametrize('restitution', [0.0, 0.5, 1.0])

@@ -119,7 +119,8 @@ def test_bad_sensor_is_refused_with_the_file(
     ('surface', 'tilt_y', float('nan'), 'between -0.1 and 0.1'),
     ('surface', 'size_x', -1.0, 'finite and not negative'), ('surface', 'size_y', 0.0, 'positive'),
     ('surface', 'restitution', 1.1, 'between 0 and 1'),
-    ('disturbance', 'torque_density', -1e-7, 'finite and not negative')])
+    ('disturbance', 'torque_density', -1e-7, 'finite and not negative'),
+    ('disturbance', 'torque_walk', -1e-7, 'finite and not negative')])
 def test_bad_effect_is_refused_by_name_with_its_limit(
     section: str, key: str, value: Any, limits: str, written: Callable[[Any], str],
 ) -> None:

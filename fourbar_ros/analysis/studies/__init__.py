@@ -13,17 +13,19 @@
 # limitations under the License.
 
 """
-Studies of the paper that can be run again, one module each.
+Studies that can be run again, one module each.
 
-A study is a module with `run(progress)` that returns a `Result`. It reads no files but presets
-and writes none: the command does.
+A study is a module with `run(progress)` that returns a `Result`; one that draws at random takes a
+`Sample` as well. It reads no files but presets and writes none: the command does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
+import os
 from typing import Any
 
 from fourbar_ros.analysis.checks import Check
@@ -32,11 +34,49 @@ from fourbar_ros.errors import FourbarError
 
 STUDIES = {
     'validation': 'section 3: our motions beside other engines and reference motions',
+    'consistency': 'the estimator in closed loops at random: NEES, NIS, errors beside their bound',
 }
+RANDOM = frozenset({'consistency'})
+"""Those that draw at random."""
+
+LARGEST_SEED = 2 ** 63 - 1
+MOST_RUNS = 1_000_000
+MOST_JOBS = 1024
 
 
 class StudyError(FourbarError):
     """A study that does not exist or cannot run."""
+
+
+def cores() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class Sample:
+    """
+    What a study draws.
+
+    :param runs: of each kind.
+    :param seed: of the first run of each kind; the others have those that follow.
+    :param jobs: processes; the result is the same for any number.
+    :raises StudyError: that is no sample.
+    """
+
+    runs: int = 100
+    seed: int = 0
+    jobs: int = field(default_factory=cores)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be drawn."""
+        for name, low, high in (('runs', 1, MOST_RUNS), ('seed', 0, LARGEST_SEED - MOST_RUNS),
+                                ('jobs', 1, MOST_JOBS)):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise StudyError(f'--{name} must be from {low} to {high}, got {value}')
 
 
 @dataclass(frozen=True)
@@ -58,13 +98,18 @@ class Result:
     skipped: Sequence[str] = ()
 
 
-def load_study(name: str) -> Callable[[Progress], Result]:
+def load_study(name: str, **sample: int) -> Callable[[Progress], Result]:
     """
     Return the function that runs a study.
 
-    :raises StudyError: there is no study of this name.
+    :param sample: what is given of a `Sample`.
+    :raises StudyError: there is no study of this name, or it does not draw that.
     """
     if name not in STUDIES:
         raise StudyError(f'no study {name!r} (known are {", ".join(STUDIES)})')
-    run: Callable[[Progress], Result] = import_module(f'{__name__}.{name}').run
-    return run
+    if sample and name not in RANDOM:
+        raise StudyError(f'study {name} draws nothing at random: it takes no '
+                         + ', '.join(f'--{option}' for option in sample))
+    drawn = {'sample': Sample(**sample)} if name in RANDOM else {}
+    run: Callable[..., Result] = import_module(f'{__name__}.{name}').run
+    return partial(run, **drawn)

@@ -1,0 +1,80 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Runs that do not need each other, spread over processes."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+import contextlib
+from multiprocessing import get_context
+import signal
+import threading
+from typing import TypeVar
+
+from fourbar_ros.errors import FourbarError
+
+_Item = TypeVar('_Item')
+_Found = TypeVar('_Found')
+
+
+class CampaignError(FourbarError):
+    """Runs that came to an end by themselves."""
+
+
+def in_processes(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: int
+                 ) -> Generator[_Found, None, None]:
+    """
+    Do some work for each item, in as many processes as there are jobs.
+
+    An interrupt reaches this process alone: runs that have begun are finished, the others are not
+    begun.
+
+    :param work: a function of a module, which other processes can import.
+    :param items: what it is given.
+    :param jobs: 1 for this process alone.
+    :returns: what it returned, in the order of the items whichever was ready first.
+    :raises CampaignError: a process died.
+    """
+    if jobs == 1 or len(items) < 2:
+        yield from map(work, items)
+        return
+    # Not by fork: whoever calls may have threads.
+    pool = ProcessPoolExecutor(min(jobs, len(items)), mp_context=get_context('spawn'))
+    try:
+        with _interrupts_ignored():
+            waiting = deque(pool.submit(work, item) for item in items)
+        while waiting:
+            yield waiting.popleft().result()
+    except BrokenProcessPool:
+        raise CampaignError('a process of the campaign died, by lack of memory perhaps: take '
+                            'fewer --jobs') from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Let the processes that are started in this block ignore interrupts, as they inherit it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
