@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Draw the figures of mechanics.md and table.md: `.venv/bin/python docs/figures.py`."""
+"""Draw the figures of the documents but those of studies: `.venv/bin/python docs/figures.py`."""
 
 from __future__ import annotations
 
@@ -22,6 +22,10 @@ from fourbar_ros.analysis.style import COLOURS, legend_above, LINK_COLOURS, RC
 from fourbar_ros.control import Controller, ControllerSettings
 from fourbar_ros.device import SimulatedTable
 from fourbar_ros.device.protocol import no_torque
+from fourbar_ros.estimation import Estimator, EstimatorSettings
+from fourbar_ros.estimation.suspicion import ALARM
+from fourbar_ros.loop.run import make_loop
+from fourbar_ros.loop.scenario import load_scenario
 from fourbar_ros.mechanism import (
     assemble,
     LINK_NAMES,
@@ -31,9 +35,9 @@ from fourbar_ros.mechanism import (
 )
 from fourbar_ros.mechanism.forces import NOTHING
 from fourbar_ros.mechanism.geometry import joint_positions
-from fourbar_ros.mechanism.layout import make_state
-from fourbar_ros.mechanism.motion import move_with_cosines
-from fourbar_ros.plant import InitialState, LinkSensorSettings, load_table, Plant, Table
+from fourbar_ros.mechanism.layout import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
+from fourbar_ros.mechanism.motion import move_held, move_with_cosines
+from fourbar_ros.plant import Fault, InitialState, LinkSensorSettings, load_table, Plant, Table
 from fourbar_ros.plant.ledger import Ledger
 from fourbar_ros.plant.motors import bearing_torque, motors_of
 from fourbar_ros.plant.table import WheelEncoders
@@ -56,7 +60,8 @@ def main() -> None:
                 ('mechanics_linkage', linkage), ('mechanics_change_point', change_point),
                 ('mechanics_conditioning', conditioning), ('table_friction', friction),
                 ('table_stiction', stiction), ('table_energy', energy),
-                ('table_sensors', sensors)):
+                ('table_sensors', sensors), ('estimation_suspicion', suspicion),
+                ('estimation_change_point', fold)):
             draw().savefig(IMAGES / f'{name}.png', dpi=110, bbox_inches='tight')
 
 
@@ -300,6 +305,80 @@ def sensors() -> Figure:
         axes.set_ylabel('abcd'[link], rotation=0, va='center', labelpad=8)
     panels[0].set_title('Sample minus truth [mrad], faults in between')
     panels[-1].set_xlabel('time of measurement [s]')
+    figure.tight_layout()
+    return figure
+
+
+def suspicion() -> Figure:
+    """Draw how a small error of one sensor is found, and what it does to the estimate."""
+    begin, error = 3.0, np.radians(0.35)
+    loop = make_loop(load_scenario('prototype'))
+    times, samples, errors, sums = [], [], [], []
+    for n in range(round((begin + 0.4) / 4e-3)):
+        if n == round(begin / 4e-3):
+            loop.testbed.device.break_down('link_c', Fault('link_c', 'wrong', error))
+        step = loop.step()
+        truth, estimate = step.samples.truth, step.estimate
+        if n * 4e-3 < begin - 0.2 or truth is None or estimate is None:
+            continue
+        now = n * 4e-3 - begin
+        times.append(now)
+        errors.append((estimate.link_angles[2] - truth.link_angles[2], estimate.angle_sigmas[2]))
+        sums.append([loop.estimator.suspicion()[name] for name in LINK_NAMES])
+        samples += [(now, reading.angles[reading.names.index('link_c')] - truth.link_angles[2])
+                    for reading in step.samples.links if 'link_c' in reading.names]
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(9.0, 3.4))
+    stamps, angles = np.array(samples).T
+    left.plot(stamps, np.degrees(angles), '.', color=LINK_COLOURS[2], markersize=3.5,
+              label='sample of link c')
+    mean, sigma = np.degrees(np.array(errors).T)
+    left.plot(times, mean, color=COLOURS['ink'], label='estimate')
+    left.fill_between(times, mean - 2.0 * sigma, mean + 2.0 * sigma, color=COLOURS['muted'],
+                      alpha=0.3, linewidth=0.0, label='two standard deviations')
+    left.set(xlabel='time since link c is off by 0.35 deg [s]', ylabel='angle minus truth [deg]')
+    legend_above(left)
+    for link, values in enumerate(np.array(sums).T):
+        right.plot(times, values, color=LINK_COLOURS[link], label=LINK_NAMES[link])
+    right.axhline(ALARM, color=COLOURS['muted'], linewidth=0.8, linestyle='--')
+    right.annotate('alarm, if 10 ahead of all others', (0.06, ALARM + 0.5), fontsize=8)
+    right.set(xlabel='time [s]', ylabel='suspicion [nats]')
+    legend_above(right)
+    figure.tight_layout()
+    return figure
+
+
+def fold() -> Figure:
+    """Draw how the filter follows a linkage that folds onto its other branch at theta = 0."""
+    mechanism = load_mechanism('prototype')
+    estimator = Estimator(mechanism, EstimatorSettings(
+        disturbance_torque=1e-5, disturbance_walk=1e-5))
+    rng, noise = np.random.default_rng(0), EstimatorSettings().angle_noise
+    state = make_state(np.full(4, 0.2), np.zeros(4))
+    stamp, speeds, rows = 1_000_000_000, np.zeros(4), []
+    for n in range(750):
+        torques = 2e-3 * np.sin(3.0 * n * 4e-3) * np.array([1.0, 1.0, -1.0, -1.0])
+        move_held(state, torques, 5e-4, 8, mechanism.constants, NOTHING)
+        before, speeds = speeds, state[WHEEL_SPEEDS] - state[LINK_RATES]
+        stamp += 4_000_000
+        estimator.measure(stamp, LINK_NAMES, list(
+            state[LINK_ANGLES] + noise * rng.standard_normal(4)))
+        estimate = estimator.tick(stamp, 0.5 * (before + speeds))
+        assert estimate is not None
+        for first in (1, 2):
+            rows.append((n * 4e-3, state[first] - state[0], estimate.link_angles[first]
+                         - state[first], estimate.angle_sigmas[first]))
+    theta, psi = np.array(rows[0::2]).T, np.array(rows[1::2]).T
+    figure, (above, below) = pyplot.subplots(2, 1, figsize=(7.0, 4.2), sharex=True)
+    for values, colour, label in ((theta, LINK_COLOURS[1], 'link b'),
+                                  (psi, LINK_COLOURS[2], 'link c')):
+        time, truth, error, sigma = values
+        above.plot(time, np.degrees(truth), color=colour, label=label)
+        below.plot(time, np.degrees(error), color=colour, linewidth=0.9)
+        below.fill_between(time, -2.0 * np.degrees(sigma), 2.0 * np.degrees(sigma), color=colour,
+                           alpha=0.2, linewidth=0.0)
+    above.set(ylabel='link minus link a [deg]')
+    legend_above(above)
+    below.set(xlabel='time [s]', ylabel='estimate minus truth [deg]', ylim=(-0.2, 0.2))
     figure.tight_layout()
     return figure
 

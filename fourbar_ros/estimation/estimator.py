@@ -237,6 +237,17 @@ class Estimator:
                 found[name] = _off_by(error, [other for other in names if other != name])
         return found
 
+    def suspicion(self) -> dict[str, float]:
+        """
+        Tell how suspicious each sensor is, by its name.
+
+        :returns: by how much a constant error is likelier than none [nats]; nothing while there is
+            no estimate.
+        """
+        if self._filter is None:
+            return {}
+        return dict(zip(SENSOR_NAMES, self._filter.suspicion().tolist()))
+
     def _alive(self, measurement: Measurement) -> Measurement | None:
         """Note the samples, and leave out those of a sensor that is stuck."""
         stuck, stamp_ns = set(), measurement.stamp_ns

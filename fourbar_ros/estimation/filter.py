@@ -187,6 +187,11 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         """Return the errors [rad] of sensors of which one, at least, is wrong, likewise."""
         return self._with_verdict(SUSPECTED)
 
+    def suspicion(self) -> Array:
+        """Return by how much an error of each sensor is likelier than none (sensors,) [nats]."""
+        sums: Array = self._suspicions[:, LIKELIHOOD].reshape(2, GYROS).max(axis=0)
+        return sums
+
     def snapshot(self) -> Snapshot:
         """Return a copy of what move and correct change, for :meth:`restore`."""
         return self.x.copy(), self.P.copy(), self._suspicions.copy(), self._gyros

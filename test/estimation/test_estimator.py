@@ -756,6 +756,9 @@ def test_pair_is_named_where_one_cannot_be_told_from_its_partner(paper: Mechanis
     faults = run.estimator.sensor_faults()
     assert set(faults) == {'link_a', 'link_c'}
     assert faults['link_a'].endswith('or link_c is')
+    suspicion = run.estimator.suspicion()
+    assert abs(suspicion['link_a'] - suspicion['link_c']) < 10.0
+    assert min(suspicion['link_a'], suspicion['link_c']) > 20.0 > suspicion['link_b']
     # Both are used on: the mean of the two is the best that there is.
     (estimate,) = run.ticks(1)
     assert estimate.innovation is not None and estimate.innovation.degrees_of_freedom == 4

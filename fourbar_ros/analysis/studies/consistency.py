@@ -83,7 +83,7 @@ class Case:
     @property
     def tuned(self) -> bool:
         """Whether it is what the prototype's tuning is held to."""
-        return self.name == 'prototype'
+        return self.name in ('prototype', 'reshaping')
 
 
 @dataclass(frozen=True, eq=False)
