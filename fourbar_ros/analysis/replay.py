@@ -333,10 +333,11 @@ class _Run:
             return ()
         answer = self._topics.receive(name, stamp_ns, message.name, message.position,
                                       message.velocity, message.effort)
+        messages = tuple(answer.messages)
         if name == TICK and not answer.rejection and (
                 not self.ticks_ns or self.ticks_ns[-1] != stamp_ns):
-            self._note_tick(stamp_ns, answer.messages)
-        return answer.messages
+            self._note_tick(stamp_ns, messages)
+        return messages
 
     def _note_tick(self, stamp_ns: int, messages: tuple[Message, ...]) -> None:
         self.ticks_ns.append(stamp_ns)

@@ -83,7 +83,6 @@ class Estimate:
     :param gyro_biases: [rad/s] by index of `SENSOR_NAMES`, of the gyros that were heard of.
     :param innovation: of the newest measurement that arrived since the last tick and corrected
         the filter, None without one.
-    :param decisions: of every sensor that was ever heard of.
     """
 
     stamp_ns: int
@@ -96,4 +95,3 @@ class Estimate:
     disturbance_sigmas: Array
     gyro_biases: dict[int, float]
     innovation: Innovation | None
-    decisions: tuple[Decision, ...]

@@ -141,7 +141,6 @@ class Estimator:
 
     :ivar rejected: number of unusable measurements by kind.
     :ivar last_rejection: what was wrong with the last one, or ''.
-    :ivar gated: number of samples that the gate refused, by sensor.
     :ivar starts: how often the filter was started.
     :ivar waiting_for: what is missing for a start, or '' while the filter runs.
     :ivar driven_by: what the last prediction knew of the wheels: one of BY_SPEED, BY_EFFORT,
@@ -151,7 +150,7 @@ class Estimator:
     def __init__(self, mechanism: Mechanism, settings: EstimatorSettings) -> None:
         self.rejected: Counter[str] = Counter()
         self.last_rejection = ''
-        self.gated: Counter[str] = Counter()
+        self._gated: Counter[str] = Counter()
         self._health = SensorHealth()
         self.starts = 0
         self.waiting_for = 'flywheel_states'
@@ -174,6 +173,8 @@ class Estimator:
         self._corrected_ns = 0
         self._lost = False
         self._decisions: dict[int, Decision] = {}
+        self._told: dict[int, Decision] = {}
+        self._seen: list[tuple[Measurement, Correction]] = []
         # Compile the kernels now, not while time runs.
         square = np.array([0.0, pi / 2.0, 0.0, pi / 2.0])
         linkage = LinkageFilter(mechanism, square, 1.0, 1.0, settings.randomness)
@@ -220,8 +221,20 @@ class Estimator:
         if len(efforts) == 4 and all(map(isfinite, efforts)):
             self._commanded = np.array(efforts, dtype=float)
 
+    @property
+    def gated(self) -> Counter[str]:
+        """Number of samples that the gate refused, by sensor."""
+        self._take_note()
+        return self._gated
+
+    def decisions(self) -> tuple[Decision, ...]:
+        """Tell what became, up to the last tick, of every sensor that was ever heard of."""
+        self._take_note()
+        return tuple(self._told.values())
+
     def sensor_faults(self) -> dict[str, str]:
         """Tell at the last tick what is wrong with sensors: a few words by the sensor's name."""
+        self._take_note()
         if self._stamp_ns is None:
             return {}
         found = self._health.faults(self._stamp_ns)
@@ -279,10 +292,12 @@ class Estimator:
         except RejectedError as error:
             self.reject(error)
             raise
+        self._take_note()
+        self._told, self._decisions = self._decisions, {
+            sensor: Decision(sensor, NO_DATA) for sensor in self._decisions}
         self._open_period(stamp_ns, speeds, efforts)
         innovation = self._relive(*self._sort_in())
         self._forget()
-        decisions = self._take_decisions()
         if self._filter is not None and stamp_ns - self._corrected_ns > LONGEST_BLIND_NS:
             self._lost = True
             self._begin_anew()
@@ -290,7 +305,7 @@ class Estimator:
         if self._filter is None:
             return None
         self.waiting_for = ''
-        return self._estimate(self._filter, stamp_ns, innovation, decisions)
+        return self._estimate(self._filter, stamp_ns, innovation)
 
     def reset(self) -> None:
         """Forget the estimate and start again, on the same turn, from what is measured next."""
@@ -302,24 +317,18 @@ class Estimator:
         self.rejected[error.kind] += 1
         self.last_rejection = str(error)
 
-    def _estimate(self, linkage: LinkageFilter, stamp_ns: int, innovation: Innovation | None,
-                  decisions: tuple[Decision, ...]) -> Estimate:
+    def _estimate(self, linkage: LinkageFilter, stamp_ns: int, innovation: Innovation | None
+                  ) -> Estimate:
         x, sigmas = linkage.x.copy(), linkage.sigmas()
         self._last_angles, self._rates = x[ANGLES], (stamp_ns, x[RATES])
         return Estimate(
             stamp_ns, x[ANGLES], x[RATES], sigmas[ANGLES], sigmas[RATES], linkage.free_covariance,
             x[TORQUES], sigmas[TORQUES],
             {gyro - GYROS: float(bias) for gyro, bias in zip(linkage.gyros, x[BIASES:])},
-            innovation, decisions)
+            innovation)
 
     def _decide(self, decision: Decision) -> None:
         self._decisions[decision.sensor] = decision
-
-    def _take_decisions(self) -> tuple[Decision, ...]:
-        """Return those since the last tick, of all sensors that were ever heard of."""
-        taken = tuple(self._decisions.values())
-        self._decisions = {sensor: Decision(sensor, NO_DATA) for sensor in self._decisions}
-        return taken
 
     def _begin_anew(self) -> None:
         self._filter, self._misfits = None, 0
@@ -344,6 +353,7 @@ class Estimator:
             self._filter = last_ns = self._last_angles = self._rates = self._wheels = None
             self._health = SensorHealth()
             self._decisions.clear()
+            self._told.clear()
         self._stamp_ns = stamp_ns
         torques, unknown = self._wheel_torques(stamp_ns, last_ns, speeds, efforts)
         self._history.append(_Period(last_ns, stamp_ns, torques, unknown, [], self._remember()))
@@ -466,7 +476,9 @@ class Estimator:
                 now_ns = stamp_ns
             seen = self._use(measurement)
             if seen is not None and any(new is measurement for new in arrived):
-                innovation = self._note(measurement, seen)
+                innovation = Innovation(
+                    measurement.sensors, seen.innovation, seen.used, seen.nis)
+                self._seen.append((measurement, seen))
         if now_ns != to_ns:
             self._move(period, now_ns, to_ns)
             period.reached = self._remember()
@@ -476,17 +488,23 @@ class Estimator:
         if self._filter is not None and from_ns is not None and from_ns < to_ns:
             self._filter.move((to_ns - from_ns) * 1e-9, period.torques, period.unknown)
 
-    def _note(self, measurement: Measurement, seen: Correction) -> Innovation:
-        """Take note of what became of samples that the filter saw for the first time."""
-        sensors = measurement.sensors
-        for sensor, fate, square in zip(sensors, seen.fate.tolist(), seen.squares.tolist()):
-            if fate == REFUSED:
-                self.gated[_name(sensor)] += 1
-            if sensor < GYROS:
-                self._health.judged(sensor, square > self._gate)
-                reason = {REFUSED: GATED, LEFT_OUT: FAULTY}.get(fate, ACCEPTED)
-                self._decide(Decision(sensor, reason, square))
-        return Innovation(sensors, seen.innovation, seen.used, seen.nis)
+    def _take_note(self) -> None:
+        """
+        Take note of what became of the samples that the last tick saw for the first time.
+
+        Whoever waits for the estimate need not wait for this.
+        """
+        for measurement, seen in self._seen:
+            for sensor, fate, square in zip(
+                    measurement.sensors, seen.fate.tolist(), seen.squares.tolist()):
+                if fate == REFUSED:
+                    self._gated[_name(sensor)] += 1
+                if sensor < GYROS:
+                    self._health.judged(sensor, square > self._gate)
+                    reason = {REFUSED: GATED, LEFT_OUT: FAULTY}.get(fate, ACCEPTED)
+                    self._told[sensor] = Decision(sensor, reason, square)
+                    self._decisions.setdefault(sensor, Decision(sensor, NO_DATA))
+        self._seen.clear()
 
     def _forget(self) -> None:
         """Drop the periods that nothing which is still accepted can belong to."""

@@ -21,7 +21,7 @@ the same answers, so a replay with the settings of the node says what the node s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from fourbar_ros.estimation.estimate import ACCEPTED, Estimate
@@ -95,11 +95,12 @@ class Answer(NamedTuple):
     """
     What a message led to.
 
-    :param messages: to be published in this order.
+    :param messages: to be published in this order, each made when it is asked for: whoever waits
+        for the first need not wait for the others.
     :param rejection: why the message was not used, or ''.
     """
 
-    messages: tuple[Message, ...] = ()
+    messages: Iterable[Message] = ()
     rejection: str = ''
 
 
@@ -112,7 +113,7 @@ class EstimatorTopics:
 
     def __init__(self, mechanism: Mechanism, settings: EstimatorSettings) -> None:
         self.estimator = Estimator(mechanism, settings)
-        self._last: tuple[int, Answer] | None = None
+        self._last: tuple[int, Estimate | None] | None = None
 
     def receive(self, topic: str, stamp_ns: int, names: Sequence[str], position: Sequence[float],
                 velocity: Sequence[float], effort: Sequence[float]) -> Answer:
@@ -144,7 +145,7 @@ class EstimatorTopics:
               effort: Sequence[float]) -> Answer:
         if self._last is not None and self._last[0] == stamp_ns:
             # A lock-step sends a tick again when its answer was lost.
-            return self._last[1]
+            return Answer(messages_of(self.estimator, *self._last))
         try:
             if tuple(names) != FLYWHEEL_NAMES:
                 error = RejectedError('wheels', f'the names must be {", ".join(FLYWHEEL_NAMES)}')
@@ -153,38 +154,39 @@ class EstimatorTopics:
             estimate = self.estimator.tick(stamp_ns, velocity, effort)
         except RejectedError as error:
             return Answer((Message(WAITING, stamp_ns),), str(error))
-        answer = Answer(messages_of(stamp_ns, estimate))
-        self._last = stamp_ns, answer
-        return answer
+        self._last = stamp_ns, estimate
+        return Answer(messages_of(self.estimator, stamp_ns, estimate))
 
 
-def messages_of(stamp_ns: int, estimate: Estimate | None) -> tuple[Message, ...]:
-    """Say what the estimate of a tick is, or that there is none: either answers a lock-step."""
+def messages_of(estimator: Estimator, stamp_ns: int, estimate: Estimate | None
+                ) -> Iterator[Message]:
+    """
+    Say what the estimate of a tick is, or that there is none: either answers a lock-step.
+
+    :param estimator: at that tick.
+    """
     if estimate is None:
-        return (Message(WAITING, stamp_ns),)
-    messages: tuple[Message, ...] = (
-        Message(STATES, stamp_ns, LINK_NAMES, (estimate.link_angles, estimate.link_rates)),
-        Message('estimate/sigma', stamp_ns, LINK_NAMES,
-                (estimate.angle_sigmas, estimate.rate_sigmas)),
-        Message('estimate/covariance', stamp_ns, COVARIANCES, (estimate.covariance[UPPER],)),
-        Message('estimate/disturbance', stamp_ns, DISTURBANCES, (
-            np.concatenate([estimate.disturbance, estimate.disturbance_sigmas]),)),
-    )
+        yield Message(WAITING, stamp_ns)
+        return
+    yield Message(STATES, stamp_ns, LINK_NAMES, (estimate.link_angles, estimate.link_rates))
+    yield Message('estimate/sigma', stamp_ns, LINK_NAMES,
+                  (estimate.angle_sigmas, estimate.rate_sigmas))
+    yield Message('estimate/covariance', stamp_ns, COVARIANCES, (estimate.covariance[UPPER],))
+    yield Message('estimate/disturbance', stamp_ns, DISTURBANCES, (
+        np.concatenate([estimate.disturbance, estimate.disturbance_sigmas]),))
     if estimate.gyro_biases:
-        names = tuple(SENSOR_NAMES[sensor] for sensor in estimate.gyro_biases)
-        messages += (Message('estimate/gyro_bias', stamp_ns, names, (
-            np.array(list(estimate.gyro_biases.values())),)),)
-    if estimate.decisions:
-        sensors, reasons, squares = zip(*estimate.decisions)
+        yield Message('estimate/gyro_bias', stamp_ns,
+                      tuple(SENSOR_NAMES[sensor] for sensor in estimate.gyro_biases), (
+                          np.array(list(estimate.gyro_biases.values())),))
+    if decisions := estimator.decisions():
+        sensors, reasons, squares = zip(*decisions)
         accepted = np.array(reasons) == ACCEPTED
-        messages += (Message(
-            'estimate/decisions', stamp_ns, tuple(SENSOR_NAMES[sensor] for sensor in sensors),
-            (np.array(reasons, float), np.array(squares), accepted.astype(float))),)
+        yield Message('estimate/decisions', stamp_ns,
+                      tuple(SENSOR_NAMES[sensor] for sensor in sensors), (
+                          np.array(reasons, float), np.array(squares), accepted.astype(float)))
     if (seen := estimate.innovation) is not None:
-        names = ('nis', 'degrees_of_freedom', *map(_name, seen.sensors))
-        messages += (Message(INNOVATION, stamp_ns, names, (
-            np.array([seen.nis, seen.degrees_of_freedom, *seen.values]),)),)
-    return messages
+        yield Message(INNOVATION, stamp_ns, ('nis', 'degrees_of_freedom', *map(
+            _name, seen.sensors)), (np.array([seen.nis, seen.degrees_of_freedom, *seen.values]),))
 
 
 def _name(sensor: int) -> str:

@@ -19,7 +19,7 @@ from functools import partial
 from fourbar_ros.estimation import EstimatorSettings
 from fourbar_ros.estimation.estimator import BY_SPEED
 from fourbar_ros.estimation.parameters import PARAMETERS
-from fourbar_ros.estimation.topics import COMMAND, EstimatorTopics, INPUTS, OUTPUTS, WAITING
+from fourbar_ros.estimation.topics import COMMAND, EstimatorTopics, INPUTS, OUTPUTS, TICK, WAITING
 from fourbar_ros.mechanism import load_mechanism
 from fourbar_ros.nodes.messages import (
     Diagnostics,
@@ -81,7 +81,7 @@ class EstimatorNode(Node):
             self._log.warn(f'{topic} rejected: {answer.rejection}')
         for published in answer.messages:
             self._publish(published)
-        if answer.messages and not answer.rejection:
+        if topic == TICK and not answer.rejection:
             self._tell_starts()
             self._diagnostics.changed()
             if self._topics.needs_commands and not self._listens_to_commands:

@@ -21,6 +21,7 @@ mean squares are amplitude / sqrt(2) and nothing else.
 """
 
 from fourbar_ros.loop import run_scenario
+from fourbar_ros.loop.run import make_loop
 from fourbar_ros.mechanism import SENSOR_NAMES
 import numpy as np
 from rosbags.rosbag2 import CompressionFormat, StoragePlugin, Writer
@@ -188,7 +189,8 @@ def closed_loop_messages(scenario, namespace=''):
         topics.setdefault(f'{namespace}/{name}', []).append((now, message))
 
     add('device_status', status(state='disarmed', mechanism=scenario.mechanism_name))
-    for step in run_scenario(scenario):
+    loop = make_loop(scenario)
+    for step in run_scenario(scenario, loop):
         stamp = step.samples.stamp_ns
         for sample in step.samples.links:
             add('link_angles', joint_state(
@@ -210,12 +212,12 @@ def closed_loop_messages(scenario, namespace=''):
         add('estimate/disturbance', joint_state(
             stamp, ['torque_a', 'torque_b', 'sigma_a', 'sigma_b'],
             [*estimate.disturbance, *estimate.disturbance_sigmas]))
-        if estimate.decisions:
+        if decisions := loop.estimator.decisions():
             add('estimate/decisions', joint_state(
-                stamp, [SENSOR_NAMES[decision.sensor] for decision in estimate.decisions],
-                [float(decision.reason) for decision in estimate.decisions],
-                [decision.square for decision in estimate.decisions],
-                [float(decision.reason == 0) for decision in estimate.decisions]))
+                stamp, [SENSOR_NAMES[decision.sensor] for decision in decisions],
+                [float(decision.reason) for decision in decisions],
+                [decision.square for decision in decisions],
+                [float(decision.reason == 0) for decision in decisions]))
         if (seen := estimate.innovation) is not None:
             add('estimate/innovation', joint_state(
                 stamp, ['nis', 'degrees_of_freedom',
