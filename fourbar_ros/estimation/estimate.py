@@ -36,6 +36,7 @@ class Innovation:
 
     :param sensors: which measured, as indices of `SENSOR_NAMES`, from `GYROS` on their gyros.
     :param values: (m,) measured minus predicted [rad], of gyros [rad/s].
+    :param squares: (m,) square of each over its variance.
     :param used: (m,) bool, False where the sample was refused.
     :param nis: normalised square of the used ones, chi-square of as many degrees of freedom if
         all is well.
@@ -43,6 +44,7 @@ class Innovation:
 
     sensors: tuple[int, ...]
     values: Array
+    squares: Array
     used: NDArray[np.bool_]
     nis: float
 

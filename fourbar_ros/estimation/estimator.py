@@ -477,7 +477,7 @@ class Estimator:
             seen = self._use(measurement)
             if seen is not None and any(new is measurement for new in arrived):
                 innovation = Innovation(
-                    measurement.sensors, seen.innovation, seen.used, seen.nis)
+                    measurement.sensors, seen.innovation, seen.squares, seen.used, seen.nis)
                 self._seen.append((measurement, seen))
         if now_ns != to_ns:
             self._move(period, now_ns, to_ns)

@@ -20,8 +20,7 @@ truth, estimate and wheels differ from it by sines with whole periods in the ste
 mean squares are amplitude / sqrt(2) and nothing else.
 """
 
-from fourbar_ros.loop import run_scenario
-from fourbar_ros.loop.run import make_loop
+from fourbar_ros.loop import make_loop, run_scenario
 from fourbar_ros.mechanism import SENSOR_NAMES
 import numpy as np
 from rosbags.rosbag2 import CompressionFormat, StoragePlugin, Writer

@@ -118,10 +118,10 @@ def follow(scenario: Scenario) -> Tally:
         covariances[n] = estimate.covariance
         if (seen := estimate.innovation) is not None:
             nis[n], degrees[n] = seen.nis, seen.degrees_of_freedom
-            squares = {decision.sensor: decision.square for decision in estimate.decisions}
-            for sensor, value, used in zip(seen.sensors, seen.values, seen.used):
+            for sensor, value, square, used in zip(
+                    seen.sensors, seen.values, seen.squares, seen.used):
                 if used and sensor < len(LINK_NAMES):
-                    innovations[n, sensor] = np.copysign(sqrt(squares[sensor]), value)
+                    innovations[n, sensor] = np.copysign(sqrt(square), value)
     known = np.isfinite(errors[:, 0])
     nees = np.zeros(len(steps))
     nees[known] = normalised_squares(errors[known, :FREE], covariances[known])
