@@ -86,6 +86,9 @@ INITIAL_ANGLE_SIGMA = 0.5
 # the motors can give, walking in a second.
 UNKNOWN_SHARE = 0.02
 
+# How long a command counts, where there is nothing better; a device disarms after as long.
+LONGEST_COMMAND_NS = 100_000_000
+
 # What drives the prediction.
 BY_SPEED, BY_EFFORT, BY_COMMAND, BY_NOTHING = (
     'wheel speeds', 'wheel efforts', 'commanded efforts', 'nothing')
@@ -168,7 +171,7 @@ class Estimator:
         self._last_angles: Array | None = None
         self._rates: tuple[int, Array] | None = None
         self._wheels: _Wheels | None = None
-        self._commanded: Array | None = None
+        self._commanded: tuple[int, Array] | None = None
         self._misfits = 0
         self._corrected_ns = 0
         self._lost = False
@@ -216,10 +219,12 @@ class Estimator:
         """
         Take note of what the motors were told, for ticks that do not tell what they did.
 
+        It counts for 0.1 s: who is told nothing any more does nothing.
+
         :param efforts: (4,) torques on the wheels [N m]; others are no help, and are left alone.
         """
         if len(efforts) == 4 and all(map(isfinite, efforts)):
-            self._commanded = np.array(efforts, dtype=float)
+            self._commanded = self._stamp_ns or 0, np.array(efforts, dtype=float)
 
     @property
     def gated(self) -> Counter[str]:
@@ -377,11 +382,13 @@ class Estimator:
             self.driven_by = BY_SPEED
             elapsed = (stamp_ns - last_ns) * 1e-9
             return self._inertias * (self._wheels.last - before.last) / elapsed, 0.0
-        given: Array | None = efforts if efforts.size else self._commanded
-        if given is None:
+        if efforts.size:
+            self.driven_by, given = BY_EFFORT, efforts
+        elif self._commanded is not None and stamp_ns - self._commanded[0] <= LONGEST_COMMAND_NS:
+            self.driven_by, given = BY_COMMAND, self._commanded[1]
+        else:
             self.driven_by = BY_NOTHING
             return np.zeros(4), self._unknown
-        self.driven_by = BY_EFFORT if efforts.size else BY_COMMAND
         # The wheel has the link's acceleration already.
         return given - self._inertias * self._accelerations(), self._unknown
 

@@ -850,6 +850,15 @@ def test_without_anything_of_the_wheels_that_is_said(paper: Mechanism) -> None:
     assert run.estimator.driven_by == 'nothing'
 
 
+def test_old_commands_do_not_count(running: Run) -> None:
+    running.estimator.commanded([1e-5] * 4)
+    driven = []
+    for n in range(1, 30):
+        running.estimator.tick(running.stamp_ns + n * PERIOD_NS, [])
+        driven.append(running.estimator.driven_by)
+    assert driven == 25 * ['commanded efforts'] + 4 * ['nothing']
+
+
 @pytest.mark.parametrize('efforts', [[0.0] * 3, [nan, 0.0, 0.0, 0.0], [inf] * 4])
 def test_commands_of_no_use_are_left_alone(efforts: list[float], running: Run) -> None:
     running.estimator.commanded(efforts)
