@@ -36,8 +36,15 @@ demo: $(INSTALLED)
 bench: $(INSTALLED)
 	@$(VENV)/bin/fourbar bench --json bench.json $(ARGS)
 
+# Those that start processes come one after the other: they need the machine for themselves.
+ALONE := node or package
 test: $(INSTALLED)
+ifeq ($(ARGS),)
+	@$(VENV)/bin/pytest -m '$(ALONE)'
+	@$(VENV)/bin/pytest -m 'not ($(ALONE))' -n auto --dist loadfile
+else
 	@$(VENV)/bin/pytest $(ARGS)
+endif
 
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .

@@ -40,6 +40,7 @@ EXTRAS = {
         'mujoco>=3.4',
         'mypy',
         'pytest',
+        'pytest-xdist',
         'ruff',
         'sympy>=1.13',
         'types-PyYAML',
