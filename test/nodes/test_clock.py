@@ -190,14 +190,14 @@ def test_clock_topic_rises_slowly_enough_and_stamps_follow_it(nodes, clock):
 
 
 def test_fast_clock_passes_as_many_times_as_fast(nodes):
-    """Within the tenth that a busy machine may lag."""
-    _, testbed, _ = nodes('plant', clock='fast', real_time_factor=5.0)
+    """Within the tenth that a busy machine may lag, at half of what two cores can keep up with."""
+    _, testbed, _ = nodes('plant', clock='fast', real_time_factor=2.0)
     testbed.wait(lambda: len(testbed.received['flywheel_states']) >= 10)
     begin = testbed.node.get_clock().now().nanoseconds
-    ticks = stamps(testbed.more('flywheel_states', 2500))
+    ticks = stamps(testbed.more('flywheel_states', 1000))
     elapsed = testbed.node.get_clock().now().nanoseconds - begin
-    assert ticks == list(range(ticks[0], ticks[0] + 2500 * PERIOD_NS, PERIOD_NS))
-    assert 2500 * PERIOD_NS / elapsed == pytest.approx(5.0, rel=0.1)
+    assert ticks == list(range(ticks[0], ticks[0] + 1000 * PERIOD_NS, PERIOD_NS))
+    assert 1000 * PERIOD_NS / elapsed == pytest.approx(2.0, rel=0.1)
 
 
 def test_real_time_has_no_clock_topic(nodes):
