@@ -39,6 +39,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
+# Whether the diagnosis has changed is looked after every so many ticks: it takes time.
+LOOK_EVERY = 5
+
 
 class EstimatorNode(Node):
     """Hand messages to the estimator and its estimates to whoever listens."""
@@ -51,7 +54,7 @@ class EstimatorNode(Node):
             load_mechanism(values.pop('mechanism')), EstimatorSettings(**values))
         self._estimator = self._topics.estimator
         self._log, self._rejected = RareLog(self), Recently()
-        self._listens_to_commands, self._starts = False, 0
+        self._listens_to_commands, self._starts, self._ticks = False, 0, 0
         self._outputs = {}
         for topic, output in OUTPUTS.items():
             if not output.optional:
@@ -83,7 +86,9 @@ class EstimatorNode(Node):
             self._publish(published)
         if topic == TICK and not answer.rejection:
             self._tell_starts()
-            self._diagnostics.changed()
+            self._ticks += 1
+            if self._ticks % LOOK_EVERY == 0:
+                self._diagnostics.changed()
             if self._topics.needs_commands and not self._listens_to_commands:
                 # Only here: these messages cost time at every tick.
                 self._listens_to_commands = True
