@@ -47,7 +47,7 @@ from fourbar_ros.estimation.estimate import (
 from fourbar_ros.estimation.filter import Correction, GYROS, LinkageFilter, Snapshot
 from fourbar_ros.estimation.health import SensorHealth
 from fourbar_ros.estimation.layout import ANGLES, BIASES, RATES, TORQUES
-from fourbar_ros.estimation.measurement import Measurement, read_measurement
+from fourbar_ros.estimation.measurement import Measurement, read_measurement, sensor_name
 from fourbar_ros.estimation.settings import EstimatorSettings
 from fourbar_ros.mechanism import ClosureError, Mechanism, SENSOR_NAMES
 from fourbar_ros.mechanism.angles import wrap_angles
@@ -169,7 +169,7 @@ class Estimator:
         self._history: list[_Period] = []
         self._stamp_ns: int | None = None
         self._last_angles: Array | None = None
-        self._rates: tuple[int, Array] | None = None
+        self._last_rates: Array | None = None
         self._wheels: _Wheels | None = None
         self._commanded: tuple[int, Array] | None = None
         self._misfits = 0
@@ -325,7 +325,7 @@ class Estimator:
     def _estimate(self, linkage: LinkageFilter, stamp_ns: int, innovation: Innovation | None
                   ) -> Estimate:
         x, sigmas = linkage.x.copy(), linkage.sigmas()
-        self._last_angles, self._rates = x[ANGLES], (stamp_ns, x[RATES])
+        self._last_angles, self._last_rates = x[ANGLES], x[RATES]
         return Estimate(
             stamp_ns, x[ANGLES], x[RATES], sigmas[ANGLES], sigmas[RATES], linkage.free_covariance,
             x[TORQUES], sigmas[TORQUES],
@@ -355,7 +355,8 @@ class Estimator:
         last_ns = self._stamp_ns
         if last_ns is not None and not 0 < stamp_ns - last_ns <= LONGEST_GAP_NS:
             self._history.clear()
-            self._filter = last_ns = self._last_angles = self._rates = self._wheels = None
+            self._filter = last_ns = self._wheels = None
+            self._last_angles = self._last_rates = None
             self._health = SensorHealth()
             self._decisions.clear()
             self._told.clear()
@@ -394,13 +395,13 @@ class Estimator:
 
     def _accelerations(self) -> Array:
         """Tell how the links were accelerated lately (4,) [rad/s^2]."""
-        if self._rates is None or not self._history:
+        if self._last_rates is None or not self._history:
             return np.zeros(4)
         period = self._history[-1]
         memory = period.before
         if memory.snapshot is None or period.from_ns is None:
             return np.zeros(4)
-        rates: Array = self._rates[1] - memory.snapshot[0][RATES]
+        rates: Array = self._last_rates - memory.snapshot[0][RATES]
         return rates / ((period.to_ns - period.from_ns) * 1e-9)
 
     def _sort_in(self) -> tuple[int, list[Measurement]]:
@@ -505,7 +506,7 @@ class Estimator:
             for sensor, fate, square in zip(
                     measurement.sensors, seen.fate.tolist(), seen.squares.tolist()):
                 if fate == REFUSED:
-                    self._gated[_name(sensor)] += 1
+                    self._gated[sensor_name(sensor)] += 1
                 if sensor < GYROS:
                     self._health.judged(sensor, square > self._gate)
                     reason = {REFUSED: GATED, LEFT_OUT: FAULTY}.get(fate, ACCEPTED)
@@ -634,11 +635,6 @@ class Estimator:
                 raise RejectedError('wheels', f'flywheel_states must hold four finite {quantity}')
         if self._stamp_ns is not None and 0 <= self._stamp_ns - stamp_ns < LONGEST_GAP_NS:
             raise RejectedError('stamp', 'tick is not newer than the last one')
-
-
-def _name(sensor: int) -> str:
-    """Return the name of a sensor, or of a gyro."""
-    return SENSOR_NAMES[sensor] if sensor < GYROS else f'gyro_{SENSOR_NAMES[sensor - GYROS]}'
 
 
 def _off_by(error: float, others: list[str]) -> str:

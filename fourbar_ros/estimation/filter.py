@@ -158,12 +158,6 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         return rates
 
     @property
-    def disturbance(self) -> Array:
-        """Return the disturbance torques on links a and b (2,) [N m]."""
-        torques: Array = self.x[TORQUES]
-        return torques
-
-    @property
     def gyros(self) -> tuple[int, ...]:
         """Return the gyros whose biases are in the state, in their order."""
         return self._gyros

@@ -73,6 +73,11 @@ class Measurement(NamedTuple):
         return np.array(found)
 
 
+def sensor_name(sensor: int) -> str:
+    """Return the name of a sensor, or of a gyro, by its index in a measurement."""
+    return SENSOR_NAMES[sensor] if sensor < GYROS else f'gyro_{SENSOR_NAMES[sensor - GYROS]}'
+
+
 def read_measurement(stamp_ns: int, names: Sequence[str], angles: Sequence[float],
                      rates: Sequence[float]) -> Measurement:
     """

@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 from fourbar_ros.estimation.estimate import ACCEPTED, Estimate
 from fourbar_ros.estimation.estimator import BY_COMMAND, BY_NOTHING, Estimator, STATE_NAMES
-from fourbar_ros.estimation.filter import GYROS
+from fourbar_ros.estimation.measurement import sensor_name
 from fourbar_ros.estimation.settings import EstimatorSettings
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism, SENSOR_NAMES
 from fourbar_ros.mechanism.by_name import RejectedError
@@ -185,10 +185,6 @@ def messages_of(estimator: Estimator, stamp_ns: int, estimate: Estimate | None
                       tuple(SENSOR_NAMES[sensor] for sensor in sensors), (
                           np.array(reasons, float), np.array(squares), accepted.astype(float)))
     if (seen := estimate.innovation) is not None:
-        yield Message(INNOVATION, stamp_ns, ('nis', 'degrees_of_freedom', *map(
-            _name, seen.sensors)), (np.array([seen.nis, seen.degrees_of_freedom, *seen.values]),))
-
-
-def _name(sensor: int) -> str:
-    """Return the name of a sensor, or of a gyro."""
-    return SENSOR_NAMES[sensor] if sensor < GYROS else f'gyro_{SENSOR_NAMES[sensor - GYROS]}'
+        names = ('nis', 'degrees_of_freedom', *map(sensor_name, seen.sensors))
+        yield Message(INNOVATION, stamp_ns, names, (
+            np.array([seen.nis, seen.degrees_of_freedom, *seen.values]),))

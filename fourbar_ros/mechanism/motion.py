@@ -31,7 +31,6 @@ from fourbar_ros.mechanism.constrained import (
     advance_constrained,
     constrained_accelerations,
     directions,
-    project_onto_closure,
 )
 from fourbar_ros.mechanism.forces import Surroundings
 from fourbar_ros.mechanism.layout import (
@@ -43,7 +42,6 @@ from fourbar_ros.mechanism.layout import (
 )
 from fourbar_ros.mechanism.reduced import (
     advance_reduced,
-    close_reduced,
     NEAR_ALIGNMENT,
     reduced_accelerations,
     side_of_joint_3,
@@ -82,21 +80,6 @@ def advance_state(state: Array, start: Array, middle: Array, end: Array, step: f
         state[12 + j] = (
             speed + step / 6.0 * (start[j] + 4.0 * middle[j] + end[j]) / inertia
             + prescribed * state[4 + j])
-
-
-@kernel
-def meet_closure(state: Array, constants: Constants) -> None:
-    """
-    Bring angles and rates of rigid links that are close to the closure onto it, in place.
-
-    Links c and d follow a and b; near alignment all four share, as by an impulse in the joints.
-    """
-    if not close_reduced(state, constants):
-        angles, rates = project_onto_closure(
-            (state[0], state[1], state[2], state[3]), (state[4], state[5], state[6], state[7]),
-            constants, True)
-        for j in range(4):
-            state[j], state[4 + j] = angles[j], rates[j]
 
 
 @kernel
