@@ -14,7 +14,7 @@
 
 """The soft step meets its ends in angle, rate and acceleration."""
 
-from fourbar_ros.control.reference import SoftStep
+from fourbar_ros.control.reference import evaluate, quintic, SoftStep
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -92,3 +92,24 @@ def test_path_is_the_motion_sampled_evenly() -> None:
     np.testing.assert_allclose(
         step.path(31), [step.at(time)[0] for time in np.linspace(0.0, 3.0, 31)],
         rtol=0.0, atol=1e-13)
+
+
+@settings(derandomize=True)
+@given(start=starts, end=starts, duration=durations)
+def test_quintic_meets_both_states(start: Array, end: Array, duration: float) -> None:
+    coefficients = quintic(start, end, duration)
+    # Coefficients reach 15 times the sizes in units of the duration, and the second derivative
+    # multiplies them by 20; some roundings of that.
+    powers = duration ** np.arange(3.0)[:, None]
+    size = ((np.abs(start) + np.abs(end)) * powers).sum(axis=0)
+    for time, state in ((0.0, start), (duration, end)):
+        off = np.abs(evaluate(coefficients, time, duration) - state) * powers
+        assert (off <= 1e-13 * 20.0 * size + 1e-300).all()
+
+
+def test_sample_is_the_same_at_many_instants() -> None:
+    step = SoftStep(np.array([[0.1, -0.2], [0.3, 0.1], [-0.1, 0.2]]), np.array([1.0, 2.0]), 3.0)
+    times = step.instants(40)
+    assert (times[0], times[-1], len(times)) == (0.0, 3.0, 40)
+    np.testing.assert_allclose(
+        step.sample(times), [step.at(time) for time in times], rtol=0.0, atol=1e-13)

@@ -20,7 +20,14 @@ from math import inf, nan, pi
 from typing import Any
 
 from fourbar_ros.control import SetpointError
-from fourbar_ros.control.setpoint import check_names
+from fourbar_ros.control.reference import SoftStep
+from fourbar_ros.control.setpoint import (
+    CHANGE_POINT_MARGIN,
+    check_names,
+    follow,
+    on_parallelogram,
+    plan,
+)
 from fourbar_ros.mechanism import (
     assemble,
     closure_error,
@@ -255,5 +262,183 @@ def test_accepted_goal_holds_what_was_named(pair: tuple[int, int], drive: Drive)
         # Joint 3 stays on its side of the diagonal: only a change point leads across.
         assert side_of_joint_3(goal) == side_of_joint_3(present), f'seed {seed}'
         for link, angle in named.items():
-            assert goal[link] == pytest.approx(angle, abs=1e-9), f'seed {seed}, {LINK_NAMES[link]}'
+            off = (goal[link] - angle + pi) % (2.0 * pi) - pi
+            assert abs(off) < 1e-9, f'seed {seed}, {LINK_NAMES[link]}'
     assert accepted > 20
+
+
+# Ways round
+
+def from_rest(mechanism: Mechanism, angles: Array, goals: dict[int, float], **options: bool
+              ) -> tuple[SoftStep, Array]:
+    start = np.array([angles[:2], [0.0, 0.0], [0.0, 0.0]])
+    return plan(mechanism, goals, start, angles, angles, 10.0, **options)
+
+
+def rhombus(phi_a: float, theta: float) -> Array:
+    return np.array([phi_a, phi_a + theta, phi_a, phi_a + theta])
+
+
+def degrees(*angles: float) -> Any:
+    return pytest.approx(np.radians(angles), abs=1e-9)
+
+
+@pytest.mark.parametrize(('theta', 'goal', 'end'), [
+    (60.0, (100.0, -90.0), (100.0, 270.0)),     # not by -150: that drags theta through 0
+    (60.0, (-170.0, -30.0), (-170.0, -30.0)),   # the shortest keeps away
+    (60.0, (170.0, -70.0), (-190.0, -70.0)),    # a by -190 and b by -130, not a by 170
+])
+def test_configuration_takes_the_way_that_keeps_away_from_change_points(
+    theta: float, goal: tuple[float, float], end: tuple[float, float], paper: Mechanism,
+) -> None:
+    start = rhombus(0.0, np.radians(theta))
+    _, reached = from_rest(paper, start, dict(enumerate(np.radians(goal).tolist())))
+    assert reached == degrees(*end, *end)
+
+
+@pytest.mark.parametrize(('pair', 'goals'), [
+    ((0, 1), (100.0, -90.0)), ((2, 1), (100.0, -90.0)), ((0, 3), (100.0, -90.0)),
+    ((2, 3), (100.0, -90.0))])
+def test_opposite_links_stand_for_each_other(
+    pair: tuple[int, int], goals: tuple[float, float], paper: Mechanism,
+) -> None:
+    _, reached = from_rest(
+        paper, rhombus(0.0, pi / 3), dict(zip(pair, np.radians(goals).tolist())))
+    assert reached == degrees(100.0, 270.0, 100.0, 270.0)
+
+
+def passes_change_point(begin: float, end: float) -> bool:
+    """Tell whether theta meets a change point between two values, by the margin, by itself."""
+    low, high = min(begin, end), max(begin, end)
+    multiple = np.ceil((low - np.arcsin(CHANGE_POINT_MARGIN)) / pi) * pi
+    return bool(multiple - np.arcsin(CHANGE_POINT_MARGIN) < high)
+
+
+@pytest.mark.parametrize('seed', range(300))
+def test_accepted_way_is_the_shortest_that_keeps_away(seed: int, paper: Mechanism) -> None:
+    """Whatever start and goal on a rhombus; theta goes straight from its start to its end."""
+    rng = np.random.default_rng(seed)
+    theta = rng.uniform(0.15, pi - 0.15) + pi * rng.integers(-2, 3)
+    angles = rhombus(rng.uniform(-10.0, 10.0), theta)
+    goals = rng.uniform(-pi, pi, 2)
+    shortest = (goals - angles[:2] + pi) % (2.0 * pi) - pi
+    ways = sorted(((shortest[0] + 2 * pi * i, shortest[1] + 2 * pi * j)
+                   for i in (-1, 0, 1) for j in (-1, 0, 1)), key=lambda way: np.hypot(*way))
+    kept = [way for way in ways if not passes_change_point(theta, theta + way[1] - way[0])]
+    for crossing in (False, True):
+        if not kept and not crossing:
+            with pytest.raises(SetpointError, match='change point'):
+                from_rest(paper, angles, dict(enumerate(goals.tolist())))
+            continue
+        _, reached = from_rest(
+            paper, angles, dict(enumerate(goals.tolist())), crossing=crossing)
+        np.testing.assert_allclose(
+            reached[:2] - angles[:2], (kept or ways)[0], atol=1e-9, err_msg=f'seed {seed}')
+
+
+def test_no_way_skips_a_change_point_between_two_looks(paper: Mechanism) -> None:
+    """From 0.02 rad beside one the margin is narrow at first, and wide at the next one."""
+    angles = rhombus(0.0, 0.02)
+    for turn in (pi + 0.5, 2 * pi + 0.5, 4 * pi + 0.5):
+        move = SoftStep(np.array([angles[:2], [0.0] * 2, [0.0] * 2]),
+                        np.array([0.0, turn]), 10.0)
+        with pytest.raises(SetpointError, match='change point'):
+            follow(paper, move, angles)
+
+
+# Change points
+
+@pytest.fixture(scope='module')
+def parallelogram() -> Mechanism:
+    """Make a parallelogram with nothing equal but opposite lengths."""
+    return Mechanism(  # type: ignore[arg-type]
+        [0.12, 0.08, 0.12, 0.08], [0.02, 0.03, 0.025, 0.018], [2.2e-5, 1.5e-5, 3e-5, 1.8e-5],
+        [[0.05, 0.01], [0.04, -0.01], [0.06, 0.005], [0.05, 0.0]], [3e-7, 4e-7, 5e-7, 2e-7])
+
+
+@pytest.mark.parametrize('theta', [0.0, pi, 0.4, -2.0, 1e-3, pi - 1e-3])
+@pytest.mark.parametrize('turns', [0, 2])
+def test_parallelogram_is_told(
+    theta: float, turns: int, paper: Mechanism, parallelogram: Mechanism, uneven: Mechanism,
+) -> None:
+    angles = rhombus(0.3, theta) + 2.0 * pi * turns * np.array([0, 0, 1, -1])
+    assert on_parallelogram(paper, angles)
+    assert on_parallelogram(parallelogram, angles)
+    assert not on_parallelogram(uneven, angles)
+    assert not on_parallelogram(paper, angles + [0.0, 0.0, 0.02, 0.0])
+
+
+@pytest.mark.parametrize('theta', [0.4, -2.0])
+def test_other_branch_is_no_parallelogram(theta: float, parallelogram: Mechanism) -> None:
+    assert on_parallelogram(parallelogram, assemble(parallelogram, 0.3, 0.3 + theta, 'open'))
+    assert not on_parallelogram(
+        parallelogram, assemble(parallelogram, 0.3, 0.3 + theta, 'crossed'))
+
+
+@pytest.mark.parametrize('goal', [0.0, -0.5, pi, pi + 0.6, 0.01])
+@pytest.mark.parametrize('start', [0.8, 0.0, pi, -0.02])
+@pytest.mark.parametrize('names', [(1,), (3,), (0, 1), (2, 3), (1, 2), (0, 3), (0, 1, 2),
+                                   (0, 2, 3), (0, 1, 2, 3)], ids=lambda links: str(links))
+def test_where_allowed_a_way_crosses_and_parks(
+    goal: float, start: float, names: tuple[int, ...], paper: Mechanism,
+    parallelogram: Mechanism,
+) -> None:
+    """From anywhere to anywhere, a change point included: opposite links stay parallel."""
+    for mechanism in (paper, parallelogram):
+        angles, wanted = rhombus(0.3, start), rhombus(0.3, goal)
+        move, reached = from_rest(
+            mechanism, angles, {link: float(wanted[link]) for link in names}, crossing=True)
+        assert np.abs(np.exp(1j * reached) - np.exp(1j * wanted)).max() < 1e-9
+        way = follow(mechanism, move, angles, crossing=True)
+        np.testing.assert_array_equal(way[:, 2:], way[:, :2])
+        np.testing.assert_allclose(way[[0, -1]], [angles, reached], atol=1e-12)
+        assert max(closure_error(mechanism, pose) for pose in way) < 1e-16
+        # No corner of a step is larger than a way can be followed.
+        assert np.abs(np.diff(way, axis=0)).max() < 0.035
+
+
+@pytest.mark.parametrize('theta', [0.0, pi])
+@pytest.mark.parametrize('crossing', [False, True])
+def test_at_a_change_point_the_whole_may_turn_and_leave(
+    theta: float, crossing: bool, paper: Mechanism,
+) -> None:
+    angles = rhombus(0.3, theta)
+    for goals in ({0: 1.0, 1: 1.0 + theta}, {0: 0.3, 1: 0.3 + theta + 0.7},
+                  {2: 0.3, 3: 0.3 + theta - 0.7}):
+        _, reached = from_rest(paper, angles, dict(goals), crossing=crossing)
+        for link, angle in goals.items():
+            assert np.exp(1j * reached[link]) == pytest.approx(np.exp(1j * angle), abs=1e-9)
+        np.testing.assert_array_equal(reached[2:], reached[:2])
+
+
+def test_crossing_is_refused_where_no_branch_leads_through(
+    paper: Mechanism, parallelogram: Mechanism,
+) -> None:
+    kite = Mechanism(  # type: ignore[arg-type]
+        [0.1, 0.1, 0.1 + 1e-4, 0.1 + 1e-4], [0.02] * 4, [2e-5] * 4, [[0.05, 0.0]] * 4, [3e-7] * 4)
+    goals = {0: 0.0, 1: -0.5}
+    with pytest.raises(SetpointError, match='only opposite links of equal length lead through'):
+        from_rest(kite, assemble(kite, 0.0, 0.8), dict(goals), crossing=True)
+    crossed = assemble(parallelogram, 0.0, 0.8, 'crossed')
+    with pytest.raises(SetpointError, match='only the parallelogram branch leads through'):
+        from_rest(parallelogram, crossed, dict(goals), crossing=True)
+    with pytest.raises(SetpointError) as caught:
+        from_rest(paper, rhombus(0.0, 0.8), dict(goals))
+    assert 'change point' in str(caught.value)
+    assert 'only' not in str(caught.value)
+
+
+def test_named_links_that_contradict_each_other_are_refused_when_crossing(
+    paper: Mechanism,
+) -> None:
+    with pytest.raises(SetpointError, match='link_c would end at 0.7000 rad and not at 0.9000'):
+        from_rest(paper, rhombus(0.0, 0.8), {0: 0.7, 1: 0.2, 2: 0.9}, crossing=True)
+    with pytest.raises(SetpointError, match='do not determine the configuration'):
+        from_rest(paper, rhombus(0.0, 0.0), {1: 0.7, 3: 0.7}, crossing=True)
+
+
+def test_motion_too_wild_to_check_is_refused(paper: Mechanism) -> None:
+    angles = rhombus(0.0, 1.0)
+    wild = SoftStep(np.array([angles[:2], [1e6, 1e6], [0.0, 0.0]]), angles[:2], 10.0)
+    with pytest.raises(SetpointError, match='can be checked'):
+        follow(paper, wild, angles)
