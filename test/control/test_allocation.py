@@ -12,77 +12,180 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Four wheels meet what two axes need, with the least acceleration."""
+"""Wheels meet what the axes need, at the least cost, as far as their motors can."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import combinations
 from math import pi
 
-from fourbar_ros.control.allocation import minimum_norm
+from fourbar_ros.control.allocation import (
+    allocate,
+    AllocationError,
+    ALLOCATIONS,
+    controllable,
+    largest_scale,
+    LOST,
+    MARGIN,
+    minimum_norm,
+    mobilities,
+    principal_axes,
+    WEAK,
+)
 from fourbar_ros.control.reference import SoftStep
 from fourbar_ros.mechanism import assemble, Mechanism, reduced_form
-from fourbar_ros.plant import InitialState, Plant, Table
-from fourbar_ros.plant.sensors import LinkSensorSettings
-from fourbar_ros.plant.table import WheelEncoders
 import numpy as np
 from numpy.typing import NDArray
 import pytest
 from scipy.linalg import null_space
+from scipy.optimize import linprog, minimize, nnls
 
 Array = NDArray[np.float64]
-SEEDS = range(20)
-Draw = Callable[[int], tuple[Array, Array, Array]]
+SEEDS = range(40)
+
+# A demand of this size in torques of that size, to which the tolerances refer [N m].
+SIZE = 1e-4
+# Gains of the drawn linkages are above WEAK, Gamma is at most 8: a few roundings of their ratio,
+# or what a torque may exceed a bound by before it is clipped (1e-10 of the torques, times Gamma).
+MET = 1e-8 * SIZE
+
+NO_LIMIT = np.full(4, np.inf)
+OPPOSITE = np.array([0.5, 0.5, -0.5, -0.5])
+
+each_seed = pytest.mark.parametrize('seed', SEEDS)
+each_allocation = pytest.mark.parametrize('name', ALLOCATIONS)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """
+    What may be asked of the wheels.
+
+    :param rows: (n, 4).
+    :param demand: (n,) [N m].
+    :param inertias: (4,) of the wheels [kg m^2].
+    :param available: (4,) bool.
+    :param lower, upper: (4,) bounds of the torques [N m].
+    """
+
+    rows: Array
+    demand: Array
+    inertias: Array
+    available: NDArray[np.bool_]
+    lower: Array
+    upper: Array
+
+    def share(self, name: str) -> tuple[Array, float]:
+        """Return torques (4,) and the scale."""
+        torques = np.full(4, np.nan)
+        scale = allocate(self.rows, self.demand, self.metric(name), self.lower, self.upper,
+                         name == 'bounded', torques)
+        return torques, scale
+
+    def metric(self, name: str) -> Array:
+        """Return the mobilities (4,)."""
+        return mobilities(name, self.inertias, self.available)
+
+
+Draw = Callable[[int], Problem]
 
 
 @pytest.fixture(scope='module')
 def draw(uneven: Mechanism) -> Draw:
-    """Draw a wheel map G of a linkage, wheel inertias and a demand."""
-    def make(seed: int) -> tuple[Array, Array, Array]:
+    """
+    Draw a linkage, two axes or three, and a demand, up to three times what the motors can give.
+
+    Every fifth motor is at its speed limit, one wheel may have failed; all axes can be driven.
+    """
+    def make(seed: int) -> Problem:
         rng = np.random.default_rng(seed)
+        lower, upper = rng.uniform(-1.0, -0.1, 4) * SIZE, rng.uniform(0.1, 1.0, 4) * SIZE
+        lower[rng.random(4) < 0.1] = 0.0
+        upper[rng.random(4) < 0.1] = 0.0
+        inertias = rng.uniform(2e-7, 1e-6, 4)
         while True:
             phi_a, theta = rng.uniform(-pi, pi), rng.uniform(0.3, 2.0)
             angles = assemble(uneven, phi_a, phi_a + theta, str(rng.choice(['open', 'crossed'])))
-            if abs(np.sin(angles[3] - angles[2])) > 0.2:
-                break
-        form = reduced_form(uneven, angles, np.zeros(2))
-        return form.wheel_map, rng.uniform(1e-7, 1e-6, 4), rng.uniform(-1e-4, 1e-4, 2)
+            rows = reduced_form(uneven, angles, np.zeros(2)).wheel_map
+            if rng.random() < 0.3:
+                rows = np.vstack([rows, OPPOSITE])
+            available = np.ones(4, dtype=bool)
+            if rng.random() < 0.4:
+                available[rng.integers(4)] = False
+            problem = Problem(rows, rng.uniform(-1.5, 1.5, len(rows)) * SIZE, inertias, available,
+                              lower, upper)
+            well_driven = all((controllable(rows, problem.metric(name))[1] == 1.0).all()
+                              for name in ALLOCATIONS[1:])
+            if abs(np.sin(angles[3] - angles[2])) > 0.2 and well_driven:
+                return problem
     return make
 
 
-@pytest.mark.parametrize('seed', SEEDS)
-def test_demand_is_met(seed: int, draw: Draw) -> None:
-    """A du + b = -G tau; a condition number of 100 and a few roundings leave 1e-13."""
-    wheel_map, inertias, demand = draw(seed)
-    torques = minimum_norm(wheel_map, inertias, demand)
-    np.testing.assert_allclose(-wheel_map @ torques, demand, rtol=0.0, atol=1e-13 * 1e-4 * 10)
+def unlimited(problem: Problem) -> Problem:
+    return replace(problem, lower=-NO_LIMIT, upper=NO_LIMIT)
 
 
-@pytest.mark.parametrize('seed', SEEDS)
-def test_any_other_answer_accelerates_the_wheels_more(seed: int, draw: Draw) -> None:
-    wheel_map, inertias, demand = draw(seed)
-    torques = minimum_norm(wheel_map, inertias, demand)
-    least = np.linalg.norm(torques / inertias)
-    free = null_space(wheel_map)
-    assert free.shape == (4, 2)
+# Without bounds
+
+@each_allocation
+@each_seed
+def test_demand_is_met_as_far_as_the_wheels_can(name: str, seed: int, draw: Draw) -> None:
+    """Two wheels of two pairs cannot drive three axes; two axes they can almost everywhere."""
+    problem = unlimited(draw(seed))
+    torques, scale = problem.share(name)
+    directions, shares = controllable(problem.rows, problem.metric(name))
+    assert scale == 1.0
+    missed = directions @ (problem.rows @ torques + problem.demand)
+    np.testing.assert_allclose(missed[shares == 1.0], 0.0, rtol=0.0, atol=MET)
+    assert name == 'two_wheels' or (shares == 1.0).all()
+
+
+@each_allocation
+@each_seed
+def test_any_other_answer_costs_more(name: str, seed: int, draw: Draw) -> None:
+    problem = unlimited(draw(seed))
+    metric = problem.metric(name)
+    used = metric > 0.0
+    torques, _ = problem.share(name)
+    assert not torques[~used].any()
+    least = (torques[used] ** 2 / metric[used]).sum()
+    free = null_space(problem.rows[:, used])
     rng = np.random.default_rng(seed)
-    for _ in range(50):
-        other = torques + free @ rng.uniform(-1e-6, 1e-6, 2)
-        assert np.linalg.norm(other / inertias) > least
+    for _ in range(50 if free.size else 0):
+        other = torques[used] + free @ rng.uniform(-SIZE, SIZE, free.shape[1])
+        assert (other ** 2 / metric[used]).sum() > least
 
 
-@pytest.mark.parametrize('seed', SEEDS)
-def test_null_space_only_loads_the_joints(seed: int, draw: Draw, uneven: Mechanism) -> None:
-    """Torques with G tau = 0 turn the wheels, and no link moves, in the plant itself."""
-    plant = Plant(uneven, Table(LinkSensorSettings(), WheelEncoders(0)),
-                  InitialState(0.1 * seed, 0.1 * seed + 1.2), 5e-4, np.random.default_rng(0))
-    angles = plant.truth().link_angles
-    free = null_space(reduced_form(uneven, angles, np.zeros(2)).wheel_map)
-    torques = free @ np.random.default_rng(seed).uniform(-5e-5, 5e-5, 2)
-    plant.advance(1, torques)
-    truth = plant.truth()
-    np.testing.assert_allclose(
-        truth.wheel_speeds, torques * 5e-4 / uneven.flywheel_inertias, rtol=1e-9, atol=1e-12)
-    # The torques alone would give 1 rad/s^2 * 0.5 ms; what is left of that is rounding.
-    assert np.abs(truth.link_rates).max() < 1e-14
+def test_least_norm_is_that_of_accelerations_and_least_energy_that_of_speeds() -> None:
+    inertias = np.array([1.0, 2.0, 3.0, 4.0])
+    everything = np.ones(4, dtype=bool)
+    np.testing.assert_array_equal(mobilities('min_norm', inertias, everything), inertias ** 2)
+    for name in ('min_energy', 'bounded'):
+        np.testing.assert_array_equal(mobilities(name, inertias, everything), inertias)
+
+
+@pytest.mark.parametrize(('available', 'used'), [
+    ((1, 1, 1, 1), (1, 1, 0, 0)), ((0, 1, 1, 1), (0, 1, 1, 0)), ((1, 0, 1, 1), (1, 0, 0, 1)),
+    ((1, 1, 0, 0), (1, 1, 0, 0)), ((0, 0, 1, 1), (0, 0, 1, 1)), ((0, 1, 0, 1), (0, 1, 0, 0)),
+    ((0, 0, 0, 0), (0, 0, 0, 0))])
+def test_two_wheels_are_one_of_each_pair(available: tuple[int, ...], used: tuple[int, ...]
+                                         ) -> None:
+    metric = mobilities('two_wheels', np.ones(4), np.array(available, dtype=bool))
+    np.testing.assert_array_equal(metric > 0.0, np.array(used, dtype=bool))
+
+
+def test_wheel_that_failed_is_left_alone_by_all() -> None:
+    for name in ALLOCATIONS:
+        for wheel in range(4):
+            available = np.arange(4) != wheel
+            assert mobilities(name, np.ones(4), available)[wheel] == 0.0
+
+
+def test_unknown_allocation_is_refused() -> None:
+    with pytest.raises(AllocationError, match="'even' is unknown .*two_wheels, min_norm"):
+        mobilities('even', np.ones(4), [True] * 4)
 
 
 def test_twins_of_the_rhombus_share_equally(paper: Mechanism) -> None:
@@ -92,43 +195,368 @@ def test_twins_of_the_rhombus_share_equally(paper: Mechanism) -> None:
         np.testing.assert_allclose(torques, [-5e-6, 1.5e-6, -5e-6, 1.5e-6], rtol=1e-12)
 
 
-def test_bigger_wheel_of_a_pair_takes_the_square_of_its_share(paper: Mechanism) -> None:
-    """Least accelerations s with If s1 + If s2 given are as If, so torques as If squared."""
+@pytest.mark.parametrize(('name', 'ratio'), [('min_norm', 4.0), ('min_energy', 2.0)])
+def test_bigger_wheel_of_a_pair_takes_the_bigger_share(name: str, ratio: float, paper: Mechanism
+                                                       ) -> None:
+    """
+    Twice the inertia: four times the torque, or twice.
+
+    Least accelerations s with If s1 + If s2 given are as If, so torques as its square; least
+    energy has equal accelerations, so torques as If.
+    """
     inertias = np.array([3e-7, 3e-7, 6e-7, 6e-7])
     form = reduced_form(paper, assemble(paper, 0.0, pi / 3), np.zeros(2))
-    torques = minimum_norm(form.wheel_map, inertias, np.array([1e-5, 1e-5]))
-    np.testing.assert_allclose(torques[2:] / torques[:2], [4.0, 4.0], rtol=1e-12)
+    torques, _ = Problem(form.wheel_map, np.array([1e-5, 1e-5]), inertias, np.ones(4, dtype=bool),
+                         -NO_LIMIT, NO_LIMIT).share(name)
+    np.testing.assert_allclose(torques[2:] / torques[:2], [ratio, ratio], rtol=1e-12)
 
 
-def peak_speed(mechanism: Mechanism, wheels: int) -> tuple[float, float]:
+def quarter_turn(mechanism: Mechanism, name: str) -> tuple[float, float, Array]:
     """
-    Turn the rhombus by a quarter in 10 s from rest, with the wheels a, b or all four.
+    Turn the rhombus by a quarter in 10 s from rest.
 
-    :returns: peak absolute wheel speed [rad/s], peak energy of the wheels (paper eq. 7) [J].
+    :returns: peak absolute wheel speed [rad/s], peak energy of the wheels (paper eq. 7) [J], and
+        speeds at half time (4,) [rad/s].
     """
     start = np.array([[0.0, pi / 3], [0.0, 0.0], [0.0, 0.0]])
     step = SoftStep(start, start[0] + pi / 2, 10.0)
     inertias = mechanism.flywheel_inertias
+    limits = mechanism.motor_torque_limits
     # Midpoints of 2 ms: the error is (h / 10 s)^2 of the speed.
     times = np.arange(1e-3, 10.0, 2e-3)
-    speeds, peak, energy = np.zeros(4), 0.0, 0.0
+    speeds, peak, energy, half = np.zeros(4), 0.0, 0.0, np.zeros(4)
     for time in times:
         angle, rate, acceleration = step.at(float(time))
         form = reduced_form(mechanism, assemble(mechanism, *angle), rate)
         demand = form.mass_matrix @ acceleration + form.bias
-        torques = np.zeros(4)
-        torques[:wheels] = minimum_norm(form.wheel_map[:, :wheels], inertias[:wheels], demand)
+        torques, scale = Problem(form.wheel_map, demand, inertias, np.ones(4, dtype=bool),
+                                 -limits, limits).share(name)
+        assert scale == 1.0
         speeds += torques / inertias * 2e-3
         peak = max(peak, float(np.abs(speeds).max()))
         energy = max(energy, 0.5 * float(inertias @ speeds ** 2))
-    return peak, energy
+        if time < 5.0:
+            half = speeds.copy()
+    return peak, energy, half
 
 
-@pytest.mark.parametrize(('wheels', 'speed', 'energy'), [
-    (4, 62.37, 2.6452e-3), (2, 124.74, 5.2904e-3)])
-def test_quarter_turn_of_the_paper(
-    wheels: int, speed: float, energy: float, paper: Mechanism,
-) -> None:
+@pytest.mark.parametrize(('name', 'speed', 'energy'), [
+    ('min_norm', 62.37, 2.6452e-3), ('min_energy', 62.37, 2.6452e-3),
+    ('bounded', 62.37, 2.6452e-3), ('two_wheels', 124.74, 5.2904e-3)])
+def test_quarter_turn_of_the_paper(name: str, speed: float, energy: float, paper: Mechanism
+                                   ) -> None:
     """The numbers follow by hand from A = 1.44e-4 kg m^2 and the peak rate of the soft step."""
-    assert peak_speed(paper, wheels) == (
+    assert quarter_turn(paper, name)[:2] == (
         pytest.approx(speed, abs=0.005), pytest.approx(energy, abs=5e-8))
+
+
+def test_least_energy_keeps_the_speeds_of_unequal_wheels_equal(paper: Mechanism) -> None:
+    """And it is the least energy for the momentum of a pair: its square over twice the inertia."""
+    uneven_wheels = replace(
+        paper, flywheel_inertias=paper.flywheel_inertias * np.array([1.0, 2.0, 3.0, 0.5]))
+    inertias = uneven_wheels.flywheel_inertias
+    _, _, speeds = quarter_turn(uneven_wheels, 'min_energy')
+    np.testing.assert_allclose(speeds[:2], speeds[2:], rtol=1e-9)
+    _, _, others = quarter_turn(uneven_wheels, 'min_norm')
+    momenta, pairs = inertias * speeds, inertias * others
+    np.testing.assert_allclose(
+        momenta[:2] + momenta[2:], pairs[:2] + pairs[2:], rtol=1e-9)
+    assert inertias @ speeds ** 2 < 0.9 * (inertias @ others ** 2)
+
+
+# All scaled together
+
+@pytest.mark.parametrize('name', ALLOCATIONS[:3])
+@each_seed
+def test_torques_are_reduced_in_proportion(name: str, seed: int, draw: Draw) -> None:
+    problem = draw(seed)
+    torques, scale = problem.share(name)
+    full, _ = unlimited(problem).share(name)
+    np.testing.assert_allclose(torques, scale * full, rtol=0.0, atol=1e-9 * SIZE)
+    assert (torques <= problem.upper).all() and (torques >= problem.lower).all()
+    # No more than needed: one of them is at its bound.
+    margin = np.where(full > 0.0, problem.upper - torques, torques - problem.lower)
+    assert scale == 1.0 or margin[full != 0.0].min() <= 1e-9 * SIZE
+
+
+def test_rounding_at_a_bound_of_zero_stops_nobody() -> None:
+    rows = np.array([[1.0, 0.0, 1.0, 1e-17], [0.0, 1.0, -1e-17, 1.0]])
+    upper = np.array([1.0, 0.0, 1.0, 0.0])
+    problem = Problem(rows, np.array([-1.0, 0.0]), np.ones(4), np.ones(4, dtype=bool),
+                      -np.array([1.0, 0.0, 1.0, 0.0]), upper)
+    for name in ('min_norm', 'bounded'):
+        torques, scale = problem.share(name)
+        assert scale == 1.0
+        np.testing.assert_allclose(torques, [0.5, 0.0, 0.5, 0.0], rtol=1e-15)
+
+
+# The best within the bounds
+
+def admitted(problem: Problem) -> float:
+    """Return the largest scale that the bounds admit, by a linear program; at most 10."""
+    used = problem.available
+    solution = linprog(
+        np.append(np.zeros(used.sum()), -1.0),
+        A_eq=np.column_stack([problem.rows[:, used], problem.demand / SIZE]),
+        b_eq=np.zeros(len(problem.demand)),
+        bounds=[*zip(problem.lower[used] / SIZE, problem.upper[used] / SIZE), (0.0, 10.0)])
+    assert solution.success
+    return float(solution.x[-1])
+
+
+def pushes_of(problem: Problem) -> tuple[Array, Array, Array]:
+    """Return rows (n, 4) and bounds (4,) in the metric of `bounded`."""
+    root = np.sqrt(problem.metric('bounded') / problem.metric('bounded').max())
+    room = np.divide([problem.lower, problem.upper], root, out=np.zeros((2, 4)), where=root > 0.0)
+    return problem.rows * root, room[0], room[1]
+
+
+def circles(problem: Problem) -> tuple[float, float]:
+    """
+    Return how far wheels within bounds can push the axes.
+
+    :returns: at least, and more than at most: if all pushed one way as strongly as the strongest.
+    """
+    pushes, low, high = pushes_of(problem)
+    count = len(pushes)
+    reaches = []
+    for others in combinations(np.flatnonzero(problem.available), count - 1):
+        normal = null_space(pushes[:, others].T)[:, 0]
+        along = normal @ pushes
+        reaches += [np.maximum(along * low, along * high).sum(),
+                    np.maximum(-along * low, -along * high).sum()]
+    return min(reaches), float(
+        np.linalg.norm(pushes, axis=0).max() * np.maximum(-low, high).sum())
+
+
+@each_seed
+def test_without_margin_the_scale_is_what_the_bounds_admit(seed: int, draw: Draw) -> None:
+    problem = draw(seed)
+    _, low, high = pushes_of(problem)
+    directions, spread, _, _ = principal_axes(problem.rows, problem.metric('bounded'))
+    goal = np.zeros(3)
+    goal[:len(directions)] = -directions @ problem.demand
+    scale = largest_scale(spread, goal, len(directions), low, high, 0.0)
+    # The tolerance of the linear program.
+    assert min(scale, 10.0) == pytest.approx(admitted(problem), abs=1e-7)
+
+
+@each_seed
+def test_demand_is_met_in_proportion_within_bounds(seed: int, draw: Draw) -> None:
+    """And the margin costs no more than its share of the most."""
+    problem = draw(seed)
+    torques, scale = problem.share('bounded')
+    np.testing.assert_allclose(-problem.rows @ torques, scale * problem.demand, rtol=0.0, atol=MET)
+    assert (torques <= problem.upper).all() and (torques >= problem.lower).all()
+    assert not torques[~problem.available].any()
+    largest = min(admitted(problem), 1.0)
+    least, most = circles(problem)
+    assert scale <= largest + 1e-7
+    if least > MARGIN * most:
+        assert scale >= largest * (1.0 - MARGIN * most / least) - 1e-7
+
+
+@each_seed
+def test_torques_within_bounds_have_their_certificate(seed: int, draw: Draw) -> None:
+    """
+    They meet the conditions of Karush, Kuhn and Tucker, which in a convex problem are enough.
+
+    The gradient tau / v is what multipliers make of the rows, less a force at upper bounds, plus
+    one at lower bounds; forces are not negative.
+    """
+    problem = draw(seed)
+    torques, _ = problem.share('bounded')
+    used = problem.available
+    x = torques[used] / SIZE
+    at_upper = x > problem.upper[used] / SIZE - 1e-9
+    at_lower = x < problem.lower[used] / SIZE + 1e-9
+    metric = problem.metric('bounded')[used]
+    gradient = x * metric.mean() / metric
+    walls, rows = np.eye(used.sum()), problem.rows[:, used].T
+    _, residual = nnls(np.column_stack(
+        [rows, -rows, -walls[:, at_upper], walls[:, at_lower]]), gradient)
+    # What is within 1e-9 of a bound counts as there; the rows make ten times as much of it.
+    assert residual < 1e-8
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_torques_within_bounds_are_those_of_a_general_solver(seed: int, draw: Draw) -> None:
+    problem = draw(seed)
+    torques, scale = problem.share('bounded')
+    used = problem.available
+    metric = problem.metric('bounded')[used] / problem.inertias.max()
+    rows, goal = problem.rows[:, used], -scale * problem.demand / SIZE
+    solution = minimize(
+        lambda x: (x ** 2 / metric).sum(), np.zeros(used.sum()), jac=lambda x: 2.0 * x / metric,
+        method='SLSQP', bounds=[*zip(problem.lower[used] / SIZE, problem.upper[used] / SIZE)],
+        constraints={'type': 'eq', 'fun': lambda x: rows @ x - goal, 'jac': lambda x: rows},
+        options={'ftol': 1e-14, 'maxiter': 200})
+    assert solution.success
+    np.testing.assert_allclose(torques[used] / SIZE, solution.x, rtol=0.0, atol=1e-6)
+
+
+def test_partner_stands_in_for_a_wheel_at_its_speed_limit(paper: Mechanism) -> None:
+    form = reduced_form(paper, assemble(paper, 0.0, pi / 3), np.zeros(2))
+    problem = Problem(form.wheel_map, np.array([-5e-5, 2e-5]), paper.flywheel_inertias,
+                      np.ones(4, dtype=bool), np.full(4, -1e-4), np.array([0.0, 1e-4, 1e-4, 1e-4]))
+    torques, scale = problem.share('bounded')
+    assert scale == 1.0
+    np.testing.assert_allclose(torques, [0.0, -1e-5, 5e-5, -1e-5], atol=1e-15)
+    torques, scale = problem.share('min_energy')
+    assert scale == 0.0
+    assert not torques.any()
+
+
+def lipschitz(problem: Problem) -> float:
+    """
+    Return what a change of the demand is multiplied by in torques at most.
+
+    Torques of least norm are those of some wheels alone, pinned or not. What is asked of them
+    follows the demand, or its way out of what the bounds admit: between an inner and an outer
+    circle, it turns by as much, and is cut by at most the ratio of the two. The margin moves the
+    inner circle in.
+    """
+    pushes, _, _ = pushes_of(problem)
+    steepest = max(1.0 / np.linalg.svd(pushes[:, [i, k]], compute_uv=False)[-1]
+                   for i, k in combinations(range(4), 2))
+    least, most = circles(problem)
+    return float(steepest * (1.0 + most / (least - MARGIN * most)))
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_torques_follow_the_demand_without_jumps(seed: int, draw: Draw) -> None:
+    problem = draw(seed)
+    limits = np.maximum(problem.upper, 0.2 * SIZE)
+    problem = replace(problem, rows=problem.rows[:2], available=np.ones(4, dtype=bool),
+                      lower=-limits, upper=limits)
+    bound = lipschitz(problem)
+    before, last, degraded = None, None, 0
+    for turn in np.linspace(0.0, 4.0 * pi, 8001):
+        demand = SIZE * (0.3 + 0.2 * turn) * np.array([np.cos(turn), np.sin(turn)])
+        torques, scale = replace(problem, demand=demand).share('bounded')
+        degraded += scale < 1.0
+        if before is not None:
+            change = np.abs(torques - before).max()
+            assert change <= bound * np.linalg.norm(demand - last) + 1e-9 * SIZE, f'at {turn:.4f}'
+        before, last = torques, demand
+    assert 1000 < degraded < 8000
+
+
+@pytest.mark.parametrize('mismatch', [1e-12, 1e-6, 1e-4])
+def test_pair_with_little_to_do_does_not_work_against_itself(mismatch: float, paper: Mechanism
+                                                             ) -> None:
+    """Lengths that almost match give almost the torques of lengths that do, at the limit too."""
+    longer = replace(paper, link_lengths=paper.link_lengths * (1.0 + mismatch * np.arange(4.0)))
+    shared = []
+    for mechanism in (paper, longer):
+        form = reduced_form(mechanism, assemble(mechanism, 0.0, 1.0), np.zeros(2))
+        torques, scale = Problem(
+            form.wheel_map, np.array([2.3e-4, 1e-5]), paper.flywheel_inertias,
+            np.ones(4, dtype=bool), np.full(4, -1e-4), np.full(4, 1e-4)).share('bounded')
+        assert scale < 1.0
+        shared.append(torques)
+    # Gamma differs by ten times the mismatch; the torques of two wheels, by that much of both.
+    np.testing.assert_allclose(shared[1], shared[0], rtol=0.0, atol=1e-13 + 1e-4 * 40 * mismatch)
+
+
+def test_pair_at_its_speed_limit_does_not_set_the_other_against_itself(paper: Mechanism) -> None:
+    """Though wheels a and c could give a little of what b and d cannot, working in opposition."""
+    longer = replace(paper, link_lengths=paper.link_lengths * (1.0 + 1e-3 * np.arange(4.0)))
+    form = reduced_form(longer, assemble(longer, 0.0, 1.0), np.zeros(2))
+    assert abs(form.gamma[0, 1]) > 1e-4
+    torques, scale = Problem(
+        form.wheel_map, np.array([0.0, -5e-5]), paper.flywheel_inertias, np.ones(4, dtype=bool),
+        np.full(4, -1e-4), np.array([1e-4, 0.0, 1e-4, 0.0])).share('bounded')
+    assert scale == 0.0
+    assert not torques.any()
+
+
+# Directions that cannot be driven
+
+def test_axis_without_wheels_is_dropped_and_the_other_met(paper: Mechanism) -> None:
+    form = reduced_form(paper, assemble(paper, 0.2, 1.4), np.zeros(2))
+    problem = Problem(form.wheel_map, np.array([3e-5, -4e-5]), paper.flywheel_inertias,
+                      np.array([False, True, False, True]), np.full(4, -1e-4), np.full(4, 1e-4))
+    for name in ALLOCATIONS:
+        expected = [0.0, 4e-5, 0.0, 0.0] if name == 'two_wheels' else [0.0, 2e-5, 0.0, 2e-5]
+        torques, scale = problem.share(name)
+        assert scale == 1.0
+        np.testing.assert_allclose(torques, expected, rtol=1e-12, atol=1e-18)
+    directions, shares = controllable(problem.rows, problem.metric('min_norm'))
+    np.testing.assert_array_equal(np.sort(shares), [0.0, 1.0])
+    np.testing.assert_allclose(np.abs(directions[shares == 1.0]), [[0.0, 1.0]], atol=1e-12)
+
+
+@each_seed
+def test_directions_are_orthonormal_and_wheels_act_on_each_alone(seed: int, draw: Draw) -> None:
+    """They are the left singular vectors of rows v^(1/2)."""
+    problem = draw(seed)
+    metric = problem.metric('min_energy')
+    directions, shares = controllable(problem.rows, metric)
+    pushes = directions @ problem.rows * np.sqrt(metric / metric.max())
+    # Entries are up to 8 and so are the gains.
+    np.testing.assert_allclose(directions @ directions.T, np.eye(len(shares)), atol=1e-14)
+    product = pushes @ pushes.T
+    np.testing.assert_allclose(product - np.diag(np.diag(product)), 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        np.sort(np.sqrt(np.diag(product))),
+        np.sort(np.linalg.svd(problem.rows * np.sqrt(metric / metric.max()), compute_uv=False)),
+        rtol=1e-12)
+
+
+def test_demand_fades_before_torques_grow() -> None:
+    """
+    Wheels b and c drive both axes, until c lies so that it cannot drive a.
+
+    Torques are at most 1 / WEAK times the demand. As a function of the rows they are the demand
+    times a function of singular values, whose slope is steepest next to LOST: (f / gain)' =
+    1 / (WEAK - LOST) / LOST; a function of matrices has the Lipschitz constant of the number's.
+    """
+    demand = np.array([0.8, 0.6])
+    metric = np.array([0.0, 1.0, 1.0, 0.0])
+    steepest = 1.0 / (WEAK - LOST) / LOST
+    before, seen = None, set()
+    step = 1e-4
+    for gamma in np.arange(-0.4, 0.4, step):
+        rows = np.array([[1.0, 0.0, gamma, 0.3], [0.0, 1.0, 0.4, 1.0]])
+        torques = np.empty(4)
+        allocate(rows, demand, metric, -NO_LIMIT, NO_LIMIT, False, torques)
+        assert np.linalg.norm(torques) <= 1.0 / WEAK * (1.0 + 1e-12)
+        if before is not None:
+            assert np.linalg.norm(torques - before) <= steepest * step * (1.0 + 1e-9)
+        before = torques
+        directions, shares = controllable(rows, metric)
+        np.testing.assert_allclose(
+            directions @ rows @ torques, -shares * (directions @ demand), atol=1e-13)
+        seen.add(float(np.ceil(shares.min())) + float(np.floor(shares.min())))
+    assert seen == {0.0, 1.0, 2.0}      # lost, weak and good
+
+
+@pytest.mark.parametrize('bounded', [False, True])
+def test_whatever_comes_torques_are_numbers_within_bounds(bounded: bool) -> None:
+    """Dependent rows, no demand, no room, no wheels, sizes apart by many orders; seed 5."""
+    rng = np.random.default_rng(5)
+    for trial in range(20_000):
+        count = int(rng.integers(1, 4))
+        rows = rng.choice([0.0, 1.0, -1.0, 0.5, 1e-9, 1.0 + 1e-15, 30.0], (count, 4))
+        if rng.random() < 0.3:
+            rows[-1] = rows[0] * rng.choice([0.0, 1.0, -2.0])
+        demand = rng.choice([0.0, 1.0, -1.0, 1e-18, 1e3, 0.3], count)
+        metric = rng.choice([0.0, 1.0, 0.5, 1e-9, 1e-14], 4)
+        lower, upper = -rng.choice([0.0, 1.0, 1e-6, 2.0], 4), rng.choice([0.0, 1.0, 0.5], 4)
+        if rng.random() < 0.2:
+            upper[rng.integers(4)] = np.inf
+        torques = np.full(4, np.nan)
+        scale = allocate(rows, demand, metric, lower, upper, bounded, torques)
+        assert 0.0 <= scale <= 1.0, f'trial {trial}'
+        assert np.isfinite(torques).all(), f'trial {trial}'
+        assert (torques <= upper).all() and (torques >= lower).all(), f'trial {trial}'
+        assert not torques[metric == 0.0].any(), f'trial {trial}'
+        if bounded and not (np.isfinite(lower).all() and np.isfinite(upper).all()):
+            continue
+        directions, shares = controllable(rows, metric)
+        missed = directions @ (rows @ torques) + scale * shares * (directions @ demand)
+        # Bounds may be exceeded by 1e-10 of torques up to scale demand / WEAK, which are clipped,
+        # and a row makes 60 times as much of it.
+        limit = 1e-10 / WEAK * 60.0 * scale * np.linalg.norm(demand)
+        assert (np.abs(missed[shares > 0.0]) <= limit + 1e-12).all(), f'trial {trial}'
