@@ -38,8 +38,8 @@ from fourbar_ros.mechanism.geometry import joint_positions
 from fourbar_ros.mechanism.layout import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
 from fourbar_ros.mechanism.motion import move_held, move_with_cosines
 from fourbar_ros.plant import Fault, InitialState, LinkSensorSettings, load_table, Plant, Table
+from fourbar_ros.plant.bearings import bearing_torque, drives_of
 from fourbar_ros.plant.ledger import Ledger
-from fourbar_ros.plant.motors import bearing_torque, motors_of
 from fourbar_ros.plant.table import WheelEncoders
 from matplotlib import pyplot, rc_context
 from matplotlib.axes import Axes
@@ -178,7 +178,7 @@ def _condition(length_a: float, offsets: Array, theta: float) -> float:
 def friction() -> Figure:
     """Draw the friction of the prototype's wheel bearings against speed."""
     bearings = load_table('prototype').wheel_bearings
-    motors = motors_of(load_mechanism('prototype'), bearings)
+    motors = drives_of(load_mechanism('prototype'), bearings)
     figure, (plain, wide) = pyplot.subplots(1, 2, figsize=(9.0, 3.4), sharey=True)
     speeds = np.linspace(-5.0, 5.0, 2001)
     plain.plot(speeds, [1e3 * bearing_torque(speed, 0.0, motors) for speed in speeds],

@@ -16,7 +16,7 @@
 The plant in motion: motors, bearings, linkage and edge, one small step after the other.
 
 In each step the torque on every wheel is constant: the mean of what the motor gives, less the
-friction of the bearing (`plant.motors`). So the linkage moves as the mechanics have it, impulse
+friction of the bearing (`plant.bearings`). So the linkage moves as the mechanics have it, impulse
 and work of every torque are exact, and only friction in joints and drag need a quadrature.
 """
 
@@ -31,6 +31,8 @@ from fourbar_ros.mechanism.constants import Array, Constants, record
 from fourbar_ros.mechanism.forces import losses, Surroundings
 from fourbar_ros.mechanism.layout import CENTRE_X, CENTRE_Y, STATE_SIZE, VELOCITY_X, VELOCITY_Y
 from fourbar_ros.mechanism.motion import advance_state, evaluate
+from fourbar_ros.mechanism.motors import available_torque, lagged_torque, Motors, speed_loop
+from fourbar_ros.plant.bearings import friction_over_step
 from fourbar_ros.plant.edge import meet_edges
 from fourbar_ros.plant.faults import WheelFaults
 from fourbar_ros.plant.ledger import (
@@ -46,13 +48,6 @@ from fourbar_ros.plant.ledger import (
     ELECTRICAL,
     JOINTS,
     TILT,
-)
-from fourbar_ros.plant.motors import (
-    available_torque,
-    friction_over_step,
-    lagged_torque,
-    Motors,
-    speed_loop,
 )
 import numpy as np
 from numpy.typing import NDArray

@@ -38,6 +38,7 @@ from fourbar_ros.mechanism.layout import (
     WHEEL_ANGLES,
     WHEEL_SPEEDS,
 )
+from fourbar_ros.plant.bearings import drives_of
 from fourbar_ros.plant.edge import joint_levers, joint_motion
 from fourbar_ros.plant.ledger import balance, CONTACTS, Ledger, nothing_added
 from fourbar_ros.plant.motion import (
@@ -46,7 +47,6 @@ from fourbar_ros.plant.motion import (
     MOTOR_STATE_SIZE,
     SOUND,
 )
-from fourbar_ros.plant.motors import motors_of
 from fourbar_ros.plant.sensors import LinkSensors
 from fourbar_ros.plant.table import quantum, Table
 import numpy as np
@@ -148,7 +148,7 @@ class Plant:
         self._half_sizes = 0.5 * np.array([surface.size_x, surface.size_y])
         # Arrays of one, see Boxed.
         self._constants = np.array([mechanism.constants])
-        self._motors = np.array([motors_of(mechanism, table.wheel_bearings)])
+        self._motors = np.array([drives_of(mechanism, table.wheel_bearings)])
         self._around = np.array([surroundings(
             joint_coulomb=table.joints.coulomb, joint_viscous=table.joints.viscous,
             joint_static_ratio=table.joints.static_ratio,

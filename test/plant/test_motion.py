@@ -19,9 +19,9 @@ from dataclasses import replace
 
 from fourbar_ros.mechanism import load_mechanism, Mechanism
 from fourbar_ros.plant import load_table, parse_fault, Plant, Table
+from fourbar_ros.plant.bearings import bearing_torque, drives_of
 from fourbar_ros.plant.faults import wheel_faults
 from fourbar_ros.plant.motion import Boxed, conditions_of, SOUND
-from fourbar_ros.plant.motors import bearing_torque, motors_of
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelBearings, WheelEncoders
 import numpy as np
@@ -137,7 +137,7 @@ def test_speed_loop_learns_anew_after_a_cut(
     plant = make_plant(quick, table=Table(LinkSensorSettings(), WheelEncoders(0), bearings))
     wanted = np.array([20.0, 50.0, -50.0, -20.0])
     plant.advance(4000, wanted, by_speed=True)
-    motors = motors_of(quick, bearings)
+    motors = drives_of(quick, bearings)
     friction = np.array([bearing_torque(speed, 0.0, motors) for speed in wanted])
     plant.advance(1, plant.truth().wheel_speeds, by_speed=True)
     np.testing.assert_allclose(plant.efforts, friction, rtol=1e-6)

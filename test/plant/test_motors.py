@@ -20,7 +20,7 @@ from dataclasses import replace
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.forces import grip
 from fourbar_ros.plant import Plant, Table
-from fourbar_ros.plant.motors import bearing_torque, motors_of
+from fourbar_ros.plant.bearings import bearing_torque, drives_of
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelBearings, WheelEncoders
 import numpy as np
@@ -98,7 +98,7 @@ def test_windings_heat_up_by_the_square_of_the_current(
 
 def test_friction_depends_on_the_speed_alone_and_opposes_it(bench: Mechanism) -> None:
     """Static at rest, half of the surplus at the Stribeck speed, then Coulomb and viscous."""
-    motors = motors_of(bench, WheelBearings(VISCOUS, COULOMB, RATIO, 2.0, 1e-4))
+    motors = drives_of(bench, WheelBearings(VISCOUS, COULOMB, RATIO, 2.0, 1e-4))
     for speed, expected in ((0.01, RATIO * COULOMB), (2.0, 1.15 * COULOMB + 2.0 * VISCOUS),
                             (300.0, COULOMB + 300.0 * VISCOUS)):
         assert bearing_torque(speed, 0.0, motors) == pytest.approx(expected, rel=1e-4)

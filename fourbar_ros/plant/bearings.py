@@ -13,24 +13,20 @@
 # limitations under the License.
 
 """
-The flywheel motors: what torque they give, what their bearings take, what they lose.
+What the bearings of the wheels take of the torque of their motors.
 
 Within a step of the plant the torque is constant, at its mean; so impulse and work are exact.
 """
 
 from __future__ import annotations
 
-from math import exp, inf, isnan
-
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.compiled import kernel
 from fourbar_ros.mechanism.constants import record
 from fourbar_ros.mechanism.forces import grip
+from fourbar_ros.mechanism.motors import FIELDS as MOTOR_FIELDS
+from fourbar_ros.mechanism.motors import motor_values, Motors
 from fourbar_ros.plant.table import WheelBearings
-import numpy as np
-
-# Bandwidth of the loop in the motor's own electronics that follows a commanded speed [rad/s].
-SPEED_BANDWIDTH = 60.0
 
 # Newton's method converges in three or four rounds; more is a number that is not finite.
 MOST_ROUNDS = 60
@@ -39,13 +35,7 @@ MOST_ROUNDS = 60
 GENTLE = 0.5
 
 FIELDS: list[tuple[str, type, tuple[int, ...]]] = [
-    ('torque_limit', float, (4,)),      # N m
-    ('speed_limit', float, (4,)),       # rad/s
-    ('time_constant', float, (4,)),     # s
-    ('torque_constant', float, (4,)),   # N m/A
-    ('resistance', float, (4,)),        # ohm
-    ('voltage', float, (4,)),           # V
-    ('inertia', float, (4,)),           # kg m^2, of the wheel
+    *MOTOR_FIELDS,
     ('viscous', float, ()),             # N m s
     ('coulomb', float, ()),             # N m
     ('static_ratio', float, ()),
@@ -53,79 +43,13 @@ FIELDS: list[tuple[str, type, tuple[int, ...]]] = [
     ('smoothing', float, ()),           # rad/s
 ]
 
-Motors = np.record
-"""What the kernels need to know of motors and bearings, made by :func:`motors_of`."""
 
-
-def motors_of(mechanism: Mechanism, bearings: WheelBearings) -> Motors:
+def drives_of(mechanism: Mechanism, bearings: WheelBearings) -> Motors:
     """Collect the parameters of the four motors and of the bearings of their wheels."""
     return record(
-        FIELDS, torque_limit=mechanism.motor_torque_limits,
-        speed_limit=mechanism.motor_speed_limits, time_constant=mechanism.motor_time_constants,
-        torque_constant=mechanism.motor_torque_constants,
-        resistance=mechanism.motor_resistances, voltage=mechanism.motor_voltages,
-        inertia=mechanism.flywheel_inertias, viscous=bearings.viscous, coulomb=bearings.coulomb,
+        FIELDS, **motor_values(mechanism), viscous=bearings.viscous, coulomb=bearings.coulomb,
         static_ratio=bearings.static_ratio, stribeck_speed=bearings.stribeck_speed,
         smoothing=bearings.smoothing)
-
-
-@kernel
-def speed_loop(wheel: int, wanted: float, speed: float, integral: float, step: float,
-               motors: Motors) -> tuple[float, float]:
-    """
-    Follow a commanded wheel speed as the motor's electronics do (PI, critically damped).
-
-    :param wanted, speed: relative to the link [rad/s].
-    :param integral: part of the torque that the loop has learnt [N m], NaN at the beginning.
-    :returns: torque to ask for [N m], and the new integral, which stands still in the limit.
-    """
-    gain = SPEED_BANDWIDTH * motors.inertia[wheel]
-    error = wanted - speed
-    limit = motors.torque_limit[wheel]
-    if isnan(integral) or ((gain * error + integral) * error > 0.0
-                           and abs(gain * error + integral) >= limit):
-        # On the way in there is nothing to learn; from here the error dies out without overshoot.
-        integral = -0.5 * gain * error
-    torque = gain * error + integral
-    if abs(torque) < limit:
-        integral += 0.25 * SPEED_BANDWIDTH * gain * error * step
-    return min(max(torque, -limit), limit), integral
-
-
-@kernel
-def available_torque(wheel: int, asked: float, speed: float, motors: Motors) -> float:
-    """
-    Limit a torque to what the motor can give [N m].
-
-    That is its torque limit, what the supply voltage leaves beyond the back-EMF, and at the speed
-    limit nothing that would drive the wheel further into it.
-    """
-    limit = motors.torque_limit[wheel]
-    torque = min(max(asked, -limit), limit)
-    if motors.resistance[wheel] > 0.0 and motors.voltage[wheel] < inf:
-        constant = motors.torque_constant[wheel]
-        slope, back = constant / motors.resistance[wheel], constant * speed
-        torque = min(max(torque, slope * (-motors.voltage[wheel] - back)),
-                     slope * (motors.voltage[wheel] - back))
-    if abs(speed) >= motors.speed_limit[wheel] and torque * speed > 0.0:
-        torque = 0.0
-    return float(torque)
-
-
-@kernel
-def lagged_torque(wheel: int, torque: float, target: float, step: float, motors: Motors
-                  ) -> tuple[float, float]:
-    """
-    Let the torque follow its target for a step.
-
-    :returns: mean over the step and value at its end [N m].
-    """
-    time_constant = motors.time_constant[wheel]
-    if time_constant <= 0.0:
-        return target, target
-    left = exp(-step / time_constant)
-    mean = target + (torque - target) * time_constant / step * (1.0 - left)
-    return mean, target + (torque - target) * left
 
 
 @kernel
