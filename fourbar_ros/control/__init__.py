@@ -14,7 +14,14 @@
 
 """What we want and how the wheels share it: references, tracking law, allocation."""
 
-from fourbar_ros.control.controller import Control, Controller, ControllerSettings
+from fourbar_ros.control.controller import Control, Controller
+from fourbar_ros.control.drive import WheelCommand
 from fourbar_ros.control.setpoint import SetpointError
+from fourbar_ros.control.settings import ControllerSettings
+from fourbar_ros.control.stability import GainError
+from fourbar_ros.control.trajectory import Point
 
-__all__ = ['Control', 'Controller', 'ControllerSettings', 'SetpointError']
+__all__ = [
+    'Control', 'Controller', 'ControllerSettings', 'GainError', 'Point', 'SetpointError',
+    'WheelCommand',
+]

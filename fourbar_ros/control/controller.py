@@ -12,45 +12,51 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The controller: estimates and setpoints in, wheel torques out, one set per tick."""
+"""The controller: estimates and setpoints in, wheel commands out, one set per tick."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import pi, sin
+from math import exp, pi, sin
 
-from fourbar_ros.control.reference import SoftStep
-from fourbar_ros.control.setpoint import check_names, plan, SetpointError
-from fourbar_ros.control.tracking import computed_torques
-from fourbar_ros.mechanism import Mechanism, nearest_assembly
+from fourbar_ros.control.accounts import Accounts, LONGEST_PERIOD
+from fourbar_ros.control.allocation import mobilities
+from fourbar_ros.control.drive import WheelCommand, WheelDrive
+from fourbar_ros.control.feasibility import check_needs, shortest_duration, Wheels
+from fourbar_ros.control.guide import Guide
+from fourbar_ros.control.law import TrackingLaw
+from fourbar_ros.control.momentum import MomentumWatch
+from fourbar_ros.control.reference import SoftStep, Way
+from fourbar_ros.control.setpoint import check_names, follow, plan, SetpointError
+from fourbar_ros.control.settings import ControllerSettings
+from fourbar_ros.control.stability import check_gains, GainError
+from fourbar_ros.control.trajectory import Point, read_trajectory
+from fourbar_ros.control.wheel_watch import SHORTED, WheelWatch
+from fourbar_ros.mechanism import FLYWHEEL_NAMES, Mechanism
 from fourbar_ros.mechanism.constants import Array
-from fourbar_ros.mechanism.dynamics import gamma_matrix
 import numpy as np
+
+MODES = ('disarmed', 'idle', 'damp', 'hold', 'track')
+"""
+What the controller does: nothing, since the device is not armed, or since it was told so; stop all
+rates; hold where the links are; follow a move.
+"""
 
 # A setpoint with a stamp (not zero, which means now) may be this far from the last tick [s].
 SETPOINT_TIMEOUT = 1.0
 
-# Closer to a change point than this |sin(phi_d - phi_c)| the wheels get no torque.
+# Closer to a change point than this |sin(phi_d - phi_c)| the wheels get no torque, where opposite
+# links are not parallel.
 NO_HOLD = 0.05
 
-# A longer silence than this between two ticks does not count as motion [s].
-LONGEST_PERIOD = 0.1
+# How soon joints count as sticking when the reference rests, and as sliding when it moves [s].
+TO_STICK, TO_SLIDE = 0.3, 0.05
 
+# A period that differs by more than this share from that for which gains were checked is new.
+SAME_PERIOD = 0.05
 
-@dataclass(frozen=True)
-class ControllerSettings:
-    """
-    How the controller behaves.
-
-    :param bandwidth: of the tracking law [rad/s].
-    :param damping: damping ratio of the tracking law.
-    :param setpoint_duration: time in which a setpoint is reached [s].
-    """
-
-    bandwidth: float = 4.0
-    damping: float = 0.9
-    setpoint_duration: float = 10.0
+ALL = np.ones(4, dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,68 +65,118 @@ class Control:
     What the controller does at a tick.
 
     :param stamp_ns: the tick [ns].
-    :param torques: (4,) on the wheels [N m].
+    :param command: what the wheels are told.
+    :param torques: (4,) that shall act on the wheels, bearings apart [N m].
     :param reference_angles, reference_rates: (4,) of the links [rad], [rad/s].
     :param angle_errors, rate_errors: (4,) reference minus estimate [rad], [rad/s].
-    :param flywheel_energy: kinetic energy of the wheels, paper eq. 7 [J].
-    :param eq9: cumulative "power" as eq. 9 is printed, since arming [J s].
-    :param work: cumulative mechanical work of the motors, without regard to sign [J].
+    :param energies: (4,) see accounts.
     """
 
     stamp_ns: int
+    command: WheelCommand
     torques: Array
     reference_angles: Array
     reference_rates: Array
     angle_errors: Array
     rate_errors: Array
-    flywheel_energy: float
-    eq9: float
-    work: float
+    energies: Array
 
 
 class Controller:
     """
-    Computed-torque tracking of (phi_a, phi_b), shared by four wheels.
+    Computed-torque tracking of the linkage, shared by four wheels.
 
     Until the device is armed, and after each disarm, the reference is the present estimate, the
     torques are zero and there is no goal.
 
-    :ivar settings: may be replaced at any time; a move under way keeps its duration.
-    :ivar mode: `disarmed`, `hold` or `track`.
-    :ivar goal: (4,) last accepted goal [rad], or None.
-    :ivar accepted, refused: number of setpoints.
-    :ivar last_refusal: why the last refused setpoint was refused, or ''.
+    :ivar settings: as they are; changed by :meth:`tune`.
+    :ivar mode: one of `MODES`.
+    :ivar accepted, refused: number of setpoints and trajectories.
+    :ivar last_refusal: why the last one was refused, or ''.
+    :ivar problem: what stopped a manoeuvre, or keeps the controller from driving, or ''.
     :ivar saturated: number of ticks at which the motors could not give what was asked.
+    :ivar law, momentum, wheels: its parts, to be looked at.
+    :ivar angles, rates, speeds: (4,) of the links and of the wheels, relative to the links, at
+        the last tick [rad], [rad/s].
     """
 
     def __init__(self, mechanism: Mechanism, settings: ControllerSettings) -> None:
         self.settings = settings
         self.mode = 'disarmed'
-        self.goal: Array | None = None
         self.accepted = 0
         self.refused = 0
         self.last_refusal = ''
+        self.problem = ''
         self.saturated = 0
-        self._mechanism = mechanism
-        self._constants = np.array([mechanism.constants])
-        self._limits: list[float] = mechanism.motor_torque_limits.tolist()
+        self.law = TrackingLaw(mechanism)
+        self.momentum = MomentumWatch(mechanism)
+        self.wheels = WheelWatch(mechanism)
+        self.mechanism = mechanism
+        self._guide = Guide(mechanism)
+        self._drive = WheelDrive(mechanism)
+        self._accounts = Accounts(mechanism)
         self._armed = False
-        self._move: SoftStep | None = None
-        self._move_start_ns = 0
-        self._reference = np.zeros((3, 2))
-        self._reference_angles = np.zeros(4)
+        self._enabled = True
+        self.speeds = np.zeros(4)
+        self.angles = np.zeros(4)
+        self.rates = np.zeros(4)
+        self._command = WheelCommand(np.zeros(4), False, ALL)
+        self._sticking = 0.0
         self._stamp_ns: int | None = None
-        self._eq9 = 0.0
-        self._work = 0.0
-        # Compile the kernels now, not while time runs.
-        square = np.array([0.0, pi / 2.0, 0.0, pi / 2.0])
-        SoftStep(np.zeros((3, 2)), np.zeros(2), 1.0).at(0.5)
-        computed_torques(square, np.zeros(4), np.zeros(2), self._constants)
-        gamma_matrix(square, mechanism.link_lengths)
+        self._last: Control | None = None
+        self._period = 0.0
+        self._checked_period = 0.0
+        self._gain_problem = ''
+        self._bearings = _bearings_of(settings)
+        self.law.tune(settings, ALL)
+        self._compile()
+
+    @property
+    def goal(self) -> Array | None:
+        """Last accepted goal of the links (4,) [rad], None without one."""
+        return self._guide.goal
+
+    def tune(self, settings: ControllerSettings) -> None:
+        """
+        Take over settings; a move under way keeps its duration.
+
+        :raises GainError: they are not stable at the rate at which it runs; nothing changes.
+        :raises AllocationError: there is no such allocation; nothing changes.
+        """
+        if self._checked_period:
+            check_gains(settings, self.mechanism, self._checked_period)
+        self.law.tune(settings, self.wheels.usable)
+        self.settings, self._gain_problem = settings, ''
+        self._bearings = _bearings_of(settings)
 
     def device_armed(self, armed: bool) -> None:
         """Follow the device's arming state."""
         self._armed = armed
+
+    def enable(self, enabled: bool) -> None:
+        """Drive the wheels when armed, from the next tick on; or leave them alone."""
+        if enabled and not self._enabled and self._armed:
+            self.mode = 'damp'
+            self._hold()
+        self._enabled = enabled
+
+    def hold(self) -> None:
+        """
+        Come to rest and stay there.
+
+        :raises SetpointError: nothing can be held now, and why.
+        """
+        self._check_driving()
+        self._hold()
+
+    def damp(self) -> None:
+        """
+        Stop all rates, wherever that ends.
+
+        :raises SetpointError: nothing can be stopped now, and why.
+        """
+        self._check_driving()
+        self.mode, self._guide.goal = 'damp', None
 
     def setpoint(self, names: Sequence[str], positions: Sequence[float], stamp_ns: int = 0
                  ) -> None:
@@ -133,106 +189,279 @@ class Controller:
         :raises SetpointError: it is refused whole, and nothing changes; also counted.
         """
         try:
-            self._plan(names, positions, stamp_ns)
+            goals = check_names(names, positions)
+            self._check_driving()
+            self._check_stamp(stamp_ns)
+            self._leave_damping()
+            guide, crossing = self._guide, self._crossing
+            step, goal = plan(
+                self.mechanism, goals, guide.motion.copy(), guide.angles, guide.destination,
+                self.settings.setpoint_duration, crossing=crossing)
+            if self.settings.setpoint_timing == 'shortest':
+                step = self._shortest(step)
+            else:
+                check_needs(self.mechanism, step, guide.angles,
+                            self._wheels_after(step.duration), crossing=crossing)
         except SetpointError as error:
-            self.refused += 1
-            self.last_refusal = str(error)
+            self._refuse(error)
             raise
-        self.accepted += 1
+        self._accept(step, goal)
 
-    def tick(self, stamp_ns: int, link_angles: Array, link_rates: Array, wheel_speeds: Array,
-             efforts: Array) -> Control:
+    def trajectory(self, names: Sequence[str], points: Sequence[Point], stamp_ns: int = 0
+                   ) -> None:
         """
-        Decide on the torques for one tick.
+        Accept a motion through several points, to start at the next tick.
+
+        :param names: of the links that the points are about.
+        :param points: see trajectory.
+        :param stamp_ns: when it shall start, 0 for now [ns].
+        :raises SetpointError: it is refused whole, and nothing changes; also counted.
+        """
+        try:
+            self._check_driving()
+            self._check_stamp(stamp_ns)
+            self._leave_damping()
+            guide, crossing = self._guide, self._crossing
+            way, goal = read_trajectory(
+                self.mechanism, names, points, guide.motion.copy(), guide.angles,
+                guide.destination, crossing=crossing)
+            check_needs(self.mechanism, way, guide.angles, self._wheels_after(way.duration),
+                        crossing=crossing)
+        except SetpointError as error:
+            self._refuse(error)
+            raise
+        self._accept(way, goal)
+
+    def tick(self, stamp_ns: int, link_angles: Array, link_rates: Array, disturbance: Array,
+             wheel_speeds: Array, efforts: Array) -> Control:
+        """
+        Decide on the commands for one tick.
 
         :param link_angles: (4,) estimated [rad].
         :param link_rates: (4,) estimated [rad/s].
+        :param disturbance: (2,) estimated torques on links a and b besides those of the wheels
+            [N m].
         :param wheel_speeds: (4,) measured, relative to the links [rad/s].
         :param efforts: (4,) torques really applied since the last tick [N m].
         """
+        if self._last is not None and self._last.stamp_ns == stamp_ns:
+            # A lock-step sends a tick again when its answer was lost.
+            return self._last
+        period = self._measure_period(stamp_ns)
+        self.speeds, self.angles, self.rates = wheel_speeds, link_angles, link_rates
+        was = self.mode
+        self._change_mode()
+        guide, driving = self._guide, self.mode not in ('disarmed', 'idle')
+        friction = self._drive.look(wheel_speeds, self.settings)
+        if driving and was not in ('disarmed', 'idle'):
+            self._watch(period, link_rates, wheel_speeds, efforts)
+        if guide.follow(stamp_ns) and self.mode == 'track':
+            self.mode = 'hold'
+        if not driving or self.mode == 'damp':
+            guide.stand_at(link_angles)
+        self._stick(period)
+        found = self.law.decide(
+            guide, link_angles, link_rates, disturbance, wheel_speeds, friction, self._sticking
+            if self.settings.rest_band > 0.0 else 0.0)
+        self.momentum.look(period, wheel_speeds, found.planned, guide.accelerations)
+        if driving and not self._out_of_hold(link_angles):
+            self.saturated += found.scale < 1.0
+            torques = found.torques.copy()
+            self._command = self._drive.command(
+                torques, guide.accelerations, wheel_speeds, self.wheels.usable, self._period,
+                self.settings.command == 'velocity')
+        else:
+            torques = np.zeros(4)
+            self._drive.begin(wheel_speeds)
+            self._command = WheelCommand(np.zeros(4), False, self.wheels.usable)
+        self._accounts.book(period, link_rates, wheel_speeds, efforts)
+        self._last = Control(
+            stamp_ns, self._command, torques, guide.angles.copy(), guide.rates.copy(),
+            guide.angles - link_angles, guide.rates - link_rates,
+            self._accounts.energies.copy())
+        return self._last
+
+    @property
+    def _crossing(self) -> bool:
+        return self.settings.change_points == 'keep'
+
+    def _measure_period(self, stamp_ns: int) -> float:
+        """Return the time since the last tick, 0 after a gap, and check the gains for it."""
+        period = 0.0
+        if self._stamp_ns is not None:
+            period = (stamp_ns - self._stamp_ns) * 1e-9
+        self._stamp_ns = stamp_ns
+        if not 0.0 < period <= 1.0:
+            return 0.0
+        self._period = period
+        if not self._checked_period or (
+                abs(period - self._checked_period) > SAME_PERIOD * self._checked_period):
+            # A tick that got lost makes a period of twice the length, and no new rate.
+            whole = round(period / self._checked_period) if self._checked_period else 0
+            if whole < 2 or abs(period - whole * self._checked_period) > SAME_PERIOD * period:
+                self._checked_period = period
+                try:
+                    check_gains(self.settings, self.mechanism, period)
+                    self._gain_problem = ''
+                except GainError as error:
+                    self._gain_problem = str(error)
+        return period if period <= LONGEST_PERIOD else 0.0
+
+    def _change_mode(self) -> None:
         was = self.mode
         if not self._armed:
-            self.mode, self.goal, self._move = 'disarmed', None, None
+            self.mode = 'disarmed'
         elif was == 'disarmed':
+            self.wheels.begin()
+            self.law.tune(self.settings, self.wheels.usable)
+            self._accounts.begin()
+            self.momentum.begin(self.speeds)
+            self.problem = ''
             self.mode = 'hold'
-            self._eq9 = self._work = 0.0
-        if not self._armed or was == 'disarmed':
-            self._reference = np.array([link_angles[:2], np.zeros(2), np.zeros(2)])
-            self._reference_angles = np.array(link_angles)
-        self._follow_move(stamp_ns)
-        reference_rates = self._reference_rates()
-        angle_errors = self._reference_angles - link_angles
-        rate_errors = reference_rates - link_rates
-        torques = np.zeros(4)
-        if self._armed:
-            torques = self._torques(link_angles, link_rates, angle_errors, rate_errors)
-        energy = self._account(stamp_ns, link_rates, wheel_speeds, efforts)
-        return Control(
-            stamp_ns, torques, self._reference_angles.copy(), reference_rates, angle_errors,
-            rate_errors, energy, self._eq9, self._work)
+        if self.mode != 'disarmed' and (not self._enabled or self._gain_problem):
+            self.mode, self.problem = 'idle', self._gain_problem
+        elif self.mode == 'idle':
+            self.mode, self.problem = 'hold', ''
+        if self.mode == 'hold' and was in ('disarmed', 'idle'):
+            self._guide.begin(self.angles)
+            self._drive.begin(self.speeds)
+            self.wheels.begin()
+        elif self.mode in ('disarmed', 'idle'):
+            self._guide.begin(self.angles)
 
-    def _plan(self, names: Sequence[str], positions: Sequence[float], stamp_ns: int) -> None:
-        goals = check_names(names, positions)
+    def _watch(self, period: float, link_rates: Array, speeds: Array, efforts: Array) -> None:
+        """Look at the wheels; take out of the allocation which cannot be used any more."""
+        if period <= 0.0:
+            return
+        command = self._command
+        if not self.wheels.look(
+                period, command.values, command.by_speed, command.powered, speeds, link_rates,
+                efforts, self._bearings):
+            return
+        if (self.wheels.verdicts == SHORTED).any():
+            wheel = int(np.argmax(self.wheels.verdicts == SHORTED))
+            self.problem = (f'{FLYWHEEL_NAMES[wheel]} runs away and cannot be cut: press the '
+                            'emergency stop')
+            self.mode, self._guide.goal = 'damp', None
+        usable = self.wheels.usable
+        if (usable == self.law.usable).all():
+            return
+        self.law.tune(self.settings, usable)
+        lost = self.law.lost_axes()
+        if lost:
+            self.problem = (f'axis {" and ".join(lost)} is lost: '
+                            f'{", ".join(self.wheels.findings())} cannot be used')
+            self._hold()
+        elif self._guide.moving and self.mode == 'track':
+            self._go_on()
+
+    def _go_on(self) -> None:
+        """Take as much longer for a move as the wheels that are left need."""
+        guide, goal = self._guide, self._guide.goal
+        if goal is None or self._stamp_ns is None:
+            return
+        left = guide.time_left(self._stamp_ns)
+        try:
+            shortest = shortest_duration(
+                self.mechanism, guide.motion.copy(), goal[:2], guide.angles,
+                self._wheels_after(0.0), crossing=self._crossing)
+            if shortest > left:
+                move = SoftStep(guide.motion.copy(), goal[:2], shortest)
+                follow(self.mechanism, move, guide.angles, crossing=self._crossing)
+                guide.go(move, goal, self._stamp_ns)
+        except SetpointError as error:
+            self.problem = f'the wheels that are left cannot go on: {error}'
+            self._hold()
+
+    def _stick(self, period: float) -> None:
+        resting = not self._guide.moving and self.mode == 'hold'
+        goes_to, time = (1.0, TO_STICK) if resting else (0.0, TO_SLIDE)
+        self._sticking += (1.0 - exp(-period / time)) * (goes_to - self._sticking)
+
+    def _out_of_hold(self, angles: Array) -> bool:
+        """Tell whether the reduced form does not exist here: the wheels coast through it."""
+        return not self._guide.parallel and abs(sin(angles[3] - angles[2])) < NO_HOLD
+
+    def _wheels_after(self, duration: float) -> Wheels:
+        """Return the wheels as they are, and what their drift takes in a time [s]."""
+        usable = self.wheels.usable
+        metric = mobilities(
+            self.settings.allocation, self.mechanism.flywheel_inertias, usable)
+        speeds = self.speeds + self.momentum.drift * min(duration, 60.0) * (
+            np.sign(self.momentum.drift) == np.sign(self.speeds))
+        friction = np.full(4, self.settings.bearing_coulomb)
+        return Wheels(speeds, metric, friction)
+
+    def _shortest(self, move: SoftStep) -> SoftStep:
+        guide = self._guide
+        duration = shortest_duration(
+            self.mechanism, move.start, move.goal, guide.angles, self._wheels_after(0.0),
+            crossing=self._crossing)
+        shortest = SoftStep(move.start, move.goal, duration)
+        follow(self.mechanism, shortest, guide.angles, crossing=self._crossing)
+        return shortest
+
+    def _leave_damping(self) -> None:
+        """Begin from the links as they move, where there is no reference that moves."""
+        if self.mode == 'damp':
+            self._hold()
+
+    def _hold(self) -> None:
+        if self._stamp_ns is None:
+            return
+        if self.mode == 'damp':
+            self._guide.move_from(self.angles, self.rates, self._stamp_ns)
+        else:
+            self._guide.halt(self._stamp_ns)
+            self._guide.goal = None
+        self.mode = 'hold'
+
+    def _accept(self, way: Way, goal: Array) -> None:
+        assert self._stamp_ns is not None
+        self._guide.go(way, goal, self._stamp_ns)
+        self.mode, self.problem = 'track', ''
+        self.accepted += 1
+
+    def _refuse(self, error: SetpointError) -> None:
+        self.refused += 1
+        self.last_refusal = str(error)
+
+    def _check_driving(self) -> None:
         if not self._armed or self.mode == 'disarmed' or self._stamp_ns is None:
             raise SetpointError('the device is not armed')
+        if not self._enabled:
+            raise SetpointError('the controller is not enabled')
+        if self.mode == 'idle':
+            raise SetpointError(self.problem or 'the controller is idle')
+        if (self.wheels.verdicts == SHORTED).any():
+            raise SetpointError(self.problem)
+
+    def _check_stamp(self, stamp_ns: int) -> None:
+        assert self._stamp_ns is not None
         if stamp_ns and abs(stamp_ns - self._stamp_ns) > SETPOINT_TIMEOUT * 1e9:
             raise SetpointError(
                 f'stamp is {(self._stamp_ns - stamp_ns) * 1e-9:.3f} s before the last tick, limit '
                 f'{SETPOINT_TIMEOUT:g} s either way')
-        going_to = self._reference_angles
-        if self._move is not None and self.goal is not None:
-            going_to = self.goal
-        self._move, self.goal = plan(
-            self._mechanism, goals, self._reference, self._reference_angles, going_to,
-            self.settings.setpoint_duration)
-        self._move_start_ns, self.mode = self._stamp_ns, 'track'
 
-    def _follow_move(self, stamp_ns: int) -> None:
-        if self._move is None:
-            return
-        elapsed = (stamp_ns - self._move_start_ns) * 1e-9
-        self._reference = self._move.at(elapsed)
-        self._reference_angles = nearest_assembly(
-            self._mechanism, (0, 1), (self._reference[0, 0], self._reference[0, 1]),
-            self._reference_angles)
-        if elapsed >= self._move.duration:
-            self._move, self.mode = None, 'hold'
+    def _compile(self) -> None:
+        """Compile the kernels now, not while time runs."""
+        square, none = np.array([0.0, pi / 2.0, 0.0, pi / 2.0]), np.zeros(4)
+        self._guide.begin(square)
+        self.law.decide(self._guide, square, none, none[:2], none, none, 0.0)
+        self.wheels.begin()
+        for by_speed in (False, True):
+            for _ in range(2):
+                self.wheels.look(1e-3, none, by_speed, ALL, none, none, none, none[:2])
+            self._drive.command(none, none, none, ALL, 1e-3, by_speed)
+        self.wheels.begin()
+        self.momentum.look(1e-3, none, none, none)
+        self.momentum.begin(none)
+        self._drive.look(none, self.settings)
+        self._accounts.book(0.0, none, none, none)
+        move = SoftStep(np.zeros((3, 2)), np.zeros(2), 1.0)
+        move.at(0.5)
+        check_needs(self.mechanism, move, square, Wheels(none, self.law.mobilities))
 
-    def _reference_rates(self) -> Array:
-        rates = self._reference[1]
-        if not rates.any():
-            return np.zeros(4)
-        # A planned move keeps its distance from change points, so Gamma exists here.
-        gamma = gamma_matrix(self._reference_angles, self._mechanism.link_lengths)
-        return np.concatenate([rates, gamma @ rates])
 
-    def _torques(self, link_angles: Array, link_rates: Array, angle_errors: Array,
-                 rate_errors: Array) -> Array:
-        if abs(sin(link_angles[3] - link_angles[2])) < NO_HOLD:
-            # Too close to a change point for the reduced form: coast through it.
-            return np.zeros(4)
-        stiffness = self.settings.bandwidth ** 2
-        damping = 2.0 * self.settings.damping * self.settings.bandwidth
-        acceleration = (self._reference[2] + damping * rate_errors[:2]
-                        + stiffness * angle_errors[:2])
-        torques = computed_torques(link_angles, link_rates, acceleration, self._constants)
-        excess = max(abs(torque) / limit for torque, limit in zip(torques.tolist(), self._limits))
-        if excess > 1.0:
-            # Scaled together, so that the direction of the motion stays.
-            self.saturated += 1
-            torques = torques / excess
-        return torques
-
-    def _account(self, stamp_ns: int, link_rates: Array, wheel_speeds: Array, efforts: Array
-                 ) -> float:
-        inertias = self._mechanism.flywheel_inertias
-        absolute = wheel_speeds + link_rates
-        # Twice the energy, and what eq. 9 adds up.
-        doubled = float(inertias @ (absolute * absolute))
-        if self._stamp_ns is not None:
-            period = (stamp_ns - self._stamp_ns) * 1e-9
-            if 0.0 < period <= LONGEST_PERIOD:
-                self._eq9 += doubled * period
-                self._work += float(np.abs(efforts * wheel_speeds).sum()) * period
-        self._stamp_ns = stamp_ns
-        return 0.5 * doubled
+def _bearings_of(settings: ControllerSettings) -> Array:
+    return np.array([settings.bearing_coulomb, settings.bearing_viscous])

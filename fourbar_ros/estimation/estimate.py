@@ -97,3 +97,10 @@ class Estimate:
     disturbance_sigmas: Array
     gyro_biases: dict[int, float]
     innovation: Innovation | None
+
+    @property
+    def link_torques(self) -> Array:
+        """Return the disturbance as torques on the four links (4,) [N m]."""
+        torques = np.zeros(4)
+        torques[:2] = self.disturbance
+        return torques

@@ -63,7 +63,7 @@ class Output(NamedTuple):
 
 STATES, INNOVATION = 'estimate/link_states', 'estimate/innovation'
 OUTPUTS = {
-    STATES: Output(LINK_NAMES, frame='table'),
+    STATES: Output(LINK_NAMES, ('position', 'velocity', 'effort'), frame='table'),
     'estimate/sigma': Output(LINK_NAMES),
     'estimate/covariance': Output(COVARIANCES, ('position',)),
     'estimate/disturbance': Output(DISTURBANCES, ('position',)),
@@ -168,7 +168,8 @@ def messages_of(estimator: Estimator, stamp_ns: int, estimate: Estimate | None
     if estimate is None:
         yield Message(WAITING, stamp_ns)
         return
-    yield Message(STATES, stamp_ns, LINK_NAMES, (estimate.link_angles, estimate.link_rates))
+    yield Message(STATES, stamp_ns, LINK_NAMES, (
+        estimate.link_angles, estimate.link_rates, estimate.link_torques))
     yield Message('estimate/sigma', stamp_ns, LINK_NAMES,
                   (estimate.angle_sigmas, estimate.rate_sigmas))
     yield Message('estimate/covariance', stamp_ns, COVARIANCES, (estimate.covariance[UPPER],))

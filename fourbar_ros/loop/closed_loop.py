@@ -25,10 +25,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from fourbar_ros.control import Control, Controller
+from fourbar_ros.control.drive import by_name
 from fourbar_ros.device import Samples, Testbed
 from fourbar_ros.device.pacing import FIRST_STAMP_NS
 from fourbar_ros.estimation import Estimate, Estimator
-from fourbar_ros.mechanism import FLYWHEEL_NAMES
 from fourbar_ros.mechanism.by_name import RejectedError
 
 
@@ -79,11 +79,11 @@ class ClosedLoop:
         if estimate is None:
             return Step(samples, None, None)
         control = self.controller.tick(
-            stamp_ns, estimate.link_angles, estimate.link_rates, samples.wheels.speeds,
-            samples.wheels.efforts)
+            stamp_ns, estimate.link_angles, estimate.link_rates, estimate.disturbance,
+            samples.wheels.speeds, samples.wheels.efforts)
+        names, velocities, efforts = by_name(control.command)
         with suppress(RejectedError):
-            self.testbed.command(
-                stamp_ns, FLYWHEEL_NAMES, (), (), control.torques.tolist(), stamp_ns)
+            self.testbed.command(stamp_ns, names, (), velocities, efforts, stamp_ns)
         return Step(samples, estimate, control)
 
     def arm(self) -> tuple[bool, str]:

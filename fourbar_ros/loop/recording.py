@@ -19,13 +19,14 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterator, Sequence
 
+from fourbar_ros.control.accounts import ENERGIES
+from fourbar_ros.control.drive import WheelCommand
 from fourbar_ros.loop.closed_loop import Step
 from fourbar_ros.mechanism import JOINT_NAMES, LINK_NAMES, SENSOR_NAMES
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 from numpy.typing import NDArray
 
-SCALARS = ('flywheel_energy_j', 'eq9_j_s', 'work_j')
 QUALITY = ('nis', 'degrees_of_freedom')
 
 LINKS = tuple('abcd')
@@ -51,8 +52,9 @@ COLUMNS = (
     ('reference_rate_', 'reference', 'velocity', LINKS),
     ('error_link_', 'tracking_error', 'position', LINKS),
     ('error_rate_', 'tracking_error', 'velocity', LINKS),
-    ('', 'energy', 'position', SCALARS),
+    ('', 'energy', 'position', ENERGIES),
     ('command_', 'flywheel_command', 'effort', LINKS),
+    ('command_speed_', 'flywheel_command', 'velocity', LINKS),
 )
 
 
@@ -94,7 +96,7 @@ class Recording:
                       velocity=truth.wheel_speeds, effort=truth.efforts)
         if (estimate := step.estimate) is not None:
             self._row('estimate/link_states', now, now, position=estimate.link_angles,
-                      velocity=estimate.link_rates)
+                      velocity=estimate.link_rates, effort=estimate.link_torques)
             self._row('estimate/sigma', now, now, position=estimate.angle_sigmas,
                       velocity=estimate.rate_sigmas)
             self._row('estimate/disturbance', now, now, position=np.concatenate(
@@ -104,13 +106,12 @@ class Recording:
                     [[seen.nis, seen.degrees_of_freedom],
                      _spread(seen.sensors, seen.values, 2 * len(SENSOR_NAMES))]))
         if (control := step.control) is not None:
-            self._row('flywheel_command', now, now, effort=control.torques)
+            self._command(now, control.command)
             self._row('reference', now, now, position=control.reference_angles,
                       velocity=control.reference_rates)
             self._row('tracking_error', now, now, position=control.angle_errors,
                       velocity=control.rate_errors)
-            self._row('energy', now, now, position=np.array(
-                [control.flywheel_energy, control.eq9, control.work]))
+            self._row('energy', now, now, position=control.energies)
 
     def arrays(self) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]:
         """Return copies of all arrays by name."""
@@ -169,6 +170,13 @@ class Recording:
         """Return the numbers of the ticks that the messages of a topic came with."""
         return np.searchsorted(
             np.array(self.tick_stamps_ns), found.get(f'{topic}.tick_ns', np.empty(0)))
+
+    def _command(self, now: int, command: WheelCommand) -> None:
+        """Take over a command: efforts or velocities, of the wheels that have power."""
+        values = np.where(command.powered, command.values, np.nan)
+        nothing = np.full(len(values), np.nan)
+        efforts, velocities = (nothing, values) if command.by_speed else (values, nothing)
+        self._row('flywheel_command', now, now, effort=efforts, velocity=velocities)
 
     def _row(self, topic: str, stamp_ns: int, tick_ns: int, **values: Array) -> None:
         if topic not in self._stamps:

@@ -72,9 +72,9 @@ def run_scenario(scenario: Scenario, loop: ClosedLoop | None = None) -> Iterator
         while waiting and tick == scenario.tick_at(waiting[0].at):
             setpoint = waiting.pop(0)
             number = len(scenario.setpoints) - len(waiting)
-            loop.controller.settings = replace(
+            loop.controller.tune(replace(
                 scenario.controller,
-                setpoint_duration=setpoint.duration or scenario.controller.setpoint_duration)
+                setpoint_duration=setpoint.duration or scenario.controller.setpoint_duration))
             try:
                 loop.controller.setpoint(
                     setpoint.names, setpoint.positions, step.samples.stamp_ns)

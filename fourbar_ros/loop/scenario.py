@@ -21,7 +21,7 @@ it is told to do, for how long, and the seed of all random numbers (docs/scenari
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from math import floor
 from pathlib import Path
@@ -29,13 +29,15 @@ from typing import Any, cast, TypeVar
 
 from fourbar_ros.configuration import check_keys, config_file, load_yaml
 from fourbar_ros.control import ControllerSettings
+from fourbar_ros.control.parameters import SETTINGS as CONTROLLER
 from fourbar_ros.device.testbed import TIMEOUT_ACTIONS
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.estimation import EstimatorSettings
-from fourbar_ros.estimation.parameters import SETTINGS
+from fourbar_ros.estimation.parameters import SETTINGS as ESTIMATOR
 from fourbar_ros.mechanism import assemble, LINK_NAMES, load_mechanism, Mechanism
 from fourbar_ros.mechanism.closure import BRANCHES
 from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.parameters import Parameter
 from fourbar_ros.plant import InitialState, load_table, Table
 
 LARGEST_SEED = 2 ** 63 - 1
@@ -146,6 +148,17 @@ class Scenario:
         }
 
 
+def _allowed(rows: Sequence[Parameter]) -> dict[str, Allowed]:
+    """Return what the table of a node allows."""
+    allowed: dict[str, Allowed] = {}
+    for row in rows:
+        if row.limits is not None:
+            allowed[row.name] = (*row.limits, row.unit)
+        elif row.choices is not None:
+            allowed[row.name] = row.choices
+    return allowed
+
+
 # The same as in the tables of the nodes.
 ALLOWED: dict[str, dict[str, Allowed]] = {
     'initial': {
@@ -155,11 +168,8 @@ ALLOWED: dict[str, dict[str, Allowed]] = {
         'rate': (1.0, 2000.0, 'Hz'), 'step': (1e-6, 0.1, 's'),
         'command_timeout': (0.002, 10.0, 's'), 'sensor_timeout': (0.002, 10.0, 's'),
         'timeout_action': TIMEOUT_ACTIONS},
-    'estimator': {
-        row.name: (*row.limits, row.unit) for row in SETTINGS if row.limits is not None},
-    'controller': {
-        'bandwidth': (0.1, 20.0, 'rad/s'), 'damping': (0.1, 2.0, ''),
-        'setpoint_duration': (0.1, 3600.0, 's')},
+    'estimator': _allowed(ESTIMATOR),
+    'controller': _allowed(CONTROLLER),
 }
 REQUIRED = ('mechanism', 'table', 'initial', 'duration', 'seed')
 OPTIONAL = ('plant', 'estimator', 'controller', 'arm_at', 'setpoints')

@@ -15,44 +15,44 @@
 """The controller as a node: estimates and setpoints in, wheel commands out."""
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from fourbar_ros.control import Controller, ControllerSettings, SetpointError
+from fourbar_ros.control import Controller, ControllerSettings, Point, SetpointError
+from fourbar_ros.control.accounts import ENERGIES
+from fourbar_ros.control.drive import by_name
+from fourbar_ros.control.parameters import PARAMETERS
+from fourbar_ros.control.scalars import (
+    ALLOCATION,
+    allocation_scalars,
+    MOMENTUM,
+    momentum_scalars,
+)
 from fourbar_ros.loop.pairing import StampPairs
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism
+from fourbar_ros.nodes.controller_services import ControllerServices
+from fourbar_ros.nodes.controller_status import ControllerStatus
 from fourbar_ros.nodes.messages import (
-    Diagnostics,
     JointStatePublisher,
     LATCHED,
-    OK,
     RareLog,
-    Recently,
     RELIABLE,
     sensor_quality,
     stamp_of,
-    status_message,
     TABLE_FRAME,
-    WARN,
 )
-from fourbar_ros.nodes.parameters import declare, Parameter
+from fourbar_ros.nodes.parameters import declare
 from fourbar_ros.nodes.runtime import run_node
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
 
-DEFAULTS = ControllerSettings()
-PARAMETERS = (
-    Parameter('mechanism', 'paper', '', 'preset or path of a mechanism file'),
-    Parameter('bandwidth', DEFAULTS.bandwidth, 'rad/s', 'of the tracking law',
-              limits=(0.1, 20.0), live=True),
-    Parameter('damping', DEFAULTS.damping, '', 'damping ratio of the tracking law',
-              limits=(0.1, 2.0), live=True),
-    Parameter('setpoint_duration', DEFAULTS.setpoint_duration, 's',
-              'time in which a setpoint is reached', limits=(0.1, 3600.0), live=True),
-)
-SCALARS = ('flywheel_energy_j', 'eq9_j_s', 'work_j')
+# What changes slowly is published every so many ticks: it takes time.
+SLOW = 5
+
+NOTHING = np.zeros(2)
 
 
 class ControllerNode(Node):
-    """Hand messages to the controller and its torques to the device."""
+    """Hand messages to the controller and its commands to the device."""
 
     def __init__(self, runtime):
         super().__init__('controller')
@@ -61,19 +61,20 @@ class ControllerNode(Node):
         mechanism = load_mechanism(values['mechanism'])
         self._controller = Controller(mechanism, _settings(values))
         self._pairs = StampPairs()
-        self._log, self._refused = RareLog(self), Recently()
-        self._announced = None
-        self._judged = ''
+        self._log = RareLog(self)
         self._last_stamp_ns = None
+        self._ticks = 0
 
         self._command = JointStatePublisher(
             self, 'flywheel_command', FLYWHEEL_NAMES, ('effort',))
         self._reference = JointStatePublisher(
             self, 'reference', LINK_NAMES, frame=TABLE_FRAME)
         self._error = JointStatePublisher(self, 'tracking_error', LINK_NAMES)
-        self._energy = JointStatePublisher(self, 'energy', SCALARS, ('position',))
-        self._status = self.create_publisher(DiagnosticStatus, 'controller_status', LATCHED)
-        self._diagnostics = Diagnostics(self, '', self._collect, guard)
+        self._energy = JointStatePublisher(self, 'energy', ENERGIES, ('position',))
+        self._allocation = JointStatePublisher(self, 'allocation', ALLOCATION, ('position',))
+        self._momentum = JointStatePublisher(self, 'momentum', MOMENTUM, ('position',))
+        self._status = ControllerStatus(self, self._controller, self._log, guard)
+        ControllerServices(self, self._controller, guard, self._status.announce)
         self.create_subscription(
             JointState, 'flywheel_states', guard(self._on_wheels), sensor_quality(self))
         self.create_subscription(
@@ -81,16 +82,19 @@ class ControllerNode(Node):
         self.create_subscription(
             DiagnosticStatus, 'device_status', guard(self._on_device), LATCHED)
         self.create_subscription(JointState, 'setpoint', guard(self._on_setpoint), RELIABLE)
-        self._announce()
+        self.create_subscription(
+            JointTrajectory, 'trajectory', guard(self._on_trajectory), RELIABLE)
+        self._status.announce()
 
     def close(self):
         """Send a last zero torque."""
         if self._last_stamp_ns is not None:
-            self._command.publish(self._last_stamp_ns, np.zeros(4))
+            self._command.publish(
+                self._last_stamp_ns, np.zeros(4), names=FLYWHEEL_NAMES, fields=('effort',))
 
     def _on_parameters(self, values):
-        self._controller.settings = _settings(values)
-        self._announce()
+        self._controller.tune(_settings(values))
+        self._status.announce()
 
     def _on_device(self, message):
         states = [item.value for item in message.values if item.key == 'state']
@@ -102,63 +106,55 @@ class ControllerNode(Node):
                 np.array(message.velocity), np.array(message.effort)))
 
     def _on_estimate(self, message):
+        # The effort of a link is what pushes it besides the wheels.
+        pushed = np.array(message.effort[:2]) if len(message.effort) == 4 else NOTHING
         self._act(stamp_of(message), 'links', (
-            np.array(message.position), np.array(message.velocity)))
+            np.array(message.position), np.array(message.velocity), pushed))
 
     def _act(self, stamp_ns, kind, value):
         pair = self._pairs.complete(stamp_ns, kind, value)
         if pair is None:
             return
         control = self._controller.tick(stamp_ns, *pair['links'], *pair['wheels'])
-        self._command.publish(stamp_ns, control.torques)
+        names, velocities, efforts = by_name(control.command)
+        if control.command.by_speed:
+            self._command.publish(stamp_ns, velocities, names=names, fields=('velocity',))
+        else:
+            self._command.publish(stamp_ns, efforts, names=names, fields=('effort',))
         self._last_stamp_ns = stamp_ns
         self._reference.publish(stamp_ns, control.reference_angles, control.reference_rates)
         self._error.publish(stamp_ns, control.angle_errors, control.rate_errors)
-        self._energy.publish(stamp_ns, (control.flywheel_energy, control.eq9, control.work))
-        self._announce()
+        self._energy.publish(stamp_ns, control.energies)
+        self._ticks += 1
+        if self._ticks % SLOW == 0:
+            self._allocation.publish(stamp_ns, allocation_scalars(self._controller))
+            names, values = momentum_scalars(self._controller)
+            self._momentum.publish(stamp_ns, values, names=names)
+        self._status.announce(running=True)
 
     def _on_setpoint(self, message):
+        self._judge('setpoint', message, lambda: self._controller.setpoint(
+            message.name, message.position, stamp_of(message)))
+
+    def _on_trajectory(self, message):
+        self._judge('trajectory', message, lambda: self._controller.trajectory(
+            message.joint_names, [Point(
+                point.positions, point.time_from_start.sec + point.time_from_start.nanosec * 1e-9,
+                point.velocities, point.accelerations, point.effort)
+                for point in message.points], stamp_of(message)))
+
+    def _judge(self, what, message, give):
         try:
-            self._controller.setpoint(message.name, message.position, stamp_of(message))
+            give()
         except SetpointError as error:
-            self._log.warn(f'setpoint refused: {error}')
-        self._judged = f'{stamp_of(message)}'
-        self._announce()
-
-    def _announce(self):
-        """Publish the status if it changed."""
-        controller = self._controller
-        present = (controller.mode, controller.accepted, controller.refused, self._judged,
-                   controller.settings)
-        if present == self._announced:
-            return
-        self._announced = present
-        goal = '' if controller.goal is None else ' '.join(
-            f'{name}={angle:.6f}' for name, angle in zip(LINK_NAMES, controller.goal))
-        self._status.publish(status_message(
-            self, '', OK, controller.mode, {
-                'mode': controller.mode, 'goal': goal,
-                'setpoint_duration_s': controller.settings.setpoint_duration,
-                'accepted': controller.accepted, 'refused': controller.refused,
-                'last_refusal': controller.last_refusal, 'judged_stamp_ns': self._judged}))
-        self._diagnostics.changed()
-
-    def _collect(self):
-        controller = self._controller
-        values = {'mode': controller.mode, 'setpoints_accepted': controller.accepted,
-                  'setpoints_refused': controller.refused,
-                  'last_refusal': controller.last_refusal,
-                  'ticks_saturated': controller.saturated}
-        if self._last_stamp_ns is None:
-            return WARN, 'waiting for flywheel_states and estimate/link_states', values
-        if self._refused.grew(controller.refused):
-            return WARN, f'{controller.mode}, setpoints were refused', values
-        return OK, controller.mode, values
+            self._log.warn(f'{what} refused: {error}')
+        self._status.judged = f'{stamp_of(message)}'
+        self._status.announce()
 
 
 def _settings(values):
     return ControllerSettings(
-        values['bandwidth'], values['damping'], values['setpoint_duration'])
+        **{name: value for name, value in values.items() if name != 'mechanism'})
 
 
 def main(argv):

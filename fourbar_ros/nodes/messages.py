@@ -88,13 +88,19 @@ class JointStatePublisher:
             setattr(self._message, field, [0.0] * len(names))
             self._views.append(np.frombuffer(getattr(self._message, field)))
 
-    def publish(self, stamp_ns, *values, names=None):
+    def publish(self, stamp_ns, *values, names=None, fields=None):
         """
         Send one message.
 
         :param values: an array for each field.
         :param names: instead of those given before, for messages that leave some out.
+        :param fields: likewise; the others are empty.
         """
+        if fields is not None and fields != self._fields:
+            for field in self._fields:
+                setattr(self._message, field, [])
+            self._fields = fields
+            self._set_names(self._names if names is None else names)
         if names is not None and names != self._names:
             self._set_names(names)
         stamp = self._message.header.stamp

@@ -21,13 +21,14 @@ The parameter tables of all nodes, and the files made from them.
 
 import sys
 
+from fourbar_ros.control.parameters import PARAMETERS as CONTROLLER_PARAMETERS
 from fourbar_ros.estimation.parameters import PARAMETERS as ESTIMATOR_PARAMETERS
-from fourbar_ros.nodes import controller, plant
+from fourbar_ros.nodes import plant
 
 TABLES = {
     'plant': plant.PARAMETERS,
     'estimator': ESTIMATOR_PARAMETERS,
-    'controller': controller.PARAMETERS,
+    'controller': CONTROLLER_PARAMETERS,
 }
 
 

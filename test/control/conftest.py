@@ -42,7 +42,7 @@ class Driven:
         """Go on by one tick, and let the links do what they are told."""
         self.stamp_ns += PERIOD_NS
         control = self.controller.tick(
-            self.stamp_ns, self.angles, self.rates, np.zeros(4), np.zeros(4))
+            self.stamp_ns, self.angles, self.rates, np.zeros(2), np.zeros(4), np.zeros(4))
         self.angles, self.rates = control.reference_angles, control.reference_rates
         return control
 

@@ -41,7 +41,7 @@ from fourbar_ros.mechanism import (
     reduced_form,
 )
 from fourbar_ros.plant import InitialState, Plant, Table
-from fourbar_ros.plant.motors import available_torque, motors_of
+from fourbar_ros.mechanism.motors import available_torque, motors_of
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelBearings, WheelEncoders
 import numpy as np

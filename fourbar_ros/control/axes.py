@@ -1,0 +1,163 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Computed torque: what the links need for an acceleration, and on which axes.
+
+The axes are links a and b, which c and d follow. Where opposite links are parallel they are the
+pairs, a with c and b with d, and there is a third axis: at a change point the links of a pair may
+turn apart, `eta = omega_c - omega_a` (docs/mechanics.md). Nothing is divided by what vanishes
+there.
+"""
+
+from __future__ import annotations
+
+from math import cos, sin
+
+from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.constrained import directions, factored_inertia
+from fourbar_ros.mechanism.dynamics import mass_matrix, reduced_terms_at
+import numpy as np
+from numpy.typing import NDArray
+
+# The hold on the branch is full up to this |sin(phi_b - phi_a)|, and beyond the second there is
+# none: the closure holds it.
+FULL_HOLD = 0.15
+NO_HOLD = 0.35
+
+# Numbers that the kernels hand over in `terms`.
+A00, A01, A11, BRANCH_INERTIA, BRANCH_ANGLE, BRANCH_RATE, HOLD, CONDITION = range(8)
+TERMS = 8
+
+
+@kernel
+def hold_on_branch(theta: float) -> float:
+    """Return how much of the hold on the branch there is, from 0 to 1, without a corner."""
+    x = (NO_HOLD - abs(sin(theta))) / (NO_HOLD - FULL_HOLD)
+    x = min(max(x, 0.0), 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+@kernel
+def axes_of(angles: Array, rates: Array, reference_angles: Array, reference_rates: Array,
+            parallel: bool, boxed: NDArray[np.record], rows: Array, errors: Array, bias: Array,
+            terms: Array) -> None:
+    """
+    Evaluate paper eq. 6 and the tracking errors on the axes.
+
+    :param angles, rates: (4,) of the links, estimated [rad], [rad/s].
+    :param reference_angles, reference_rates: (4,) likewise.
+    :param parallel: whether opposite links are parallel, or meant to be.
+    :param boxed: (1,) constants of the mechanism.
+    :param rows: (3, 4) receives G, and the row of eta where opposite links are parallel.
+    :param errors: (2, 2) receives reference minus estimate, angles [rad] and rates [rad/s].
+    :param bias: (3,) receives b, and that of eta [N m].
+    :param terms: (TERMS,) receives A, and what is known of eta: its inertia [kg m^2], angle [rad]
+        and rate [rad/s] beside the reference, how much it is to be held, and cond(A).
+    """
+    constants = boxed[0]
+    if parallel:
+        _parallel_axes(angles, rates, reference_angles, reference_rates, boxed, rows, errors,
+                       bias, terms)
+    else:
+        a00, a01, a11, b0, b1, g1, g2, g3, g4, _, _ = reduced_terms_at(angles, rates, constants)
+        rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3] = 1.0, 0.0, g1, g3
+        rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3] = 0.0, 1.0, g2, g4
+        rows[2] = 0.0
+        bias[0], bias[1], bias[2] = b0, b1, 0.0
+        terms[A00], terms[A01], terms[A11] = a00, a01, a11
+        terms[BRANCH_INERTIA:] = 0.0
+        for axis in range(2):
+            errors[0, axis] = reference_angles[axis] - angles[axis]
+            errors[1, axis] = reference_rates[axis] - rates[axis]
+    mean = 0.5 * (terms[A00] + terms[A11])
+    half = 0.5 * (terms[A00] - terms[A11])
+    spread = (half * half + terms[A01] * terms[A01]) ** 0.5
+    terms[CONDITION] = (mean + spread) / (mean - spread)
+
+
+@kernel
+def _parallel_axes(angles: Array, rates: Array, reference_angles: Array, reference_rates: Array,
+                   boxed: NDArray[np.record], rows: Array, errors: Array, bias: Array,
+                   terms: Array) -> None:
+    constants = boxed[0]
+    theta = 0.5 * (angles[1] + angles[3] - angles[0] - angles[2])
+    sign = 1.0 if cos(theta) >= 0.0 else -1.0
+    rows[:] = 0.0
+    rows[0, 0] = rows[0, 2] = rows[1, 1] = rows[1, 3] = 1.0
+    rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3] = -0.5, -0.5 * sign, 0.5, 0.5 * sign
+    matrix = mass_matrix(angles, constants)
+    cosines, sines = directions((angles[0], angles[1], angles[2], angles[3]))
+    _, h = factored_inertia(
+        cosines, sines, (rates[0], rates[1], rates[2], rates[3]), constants)
+    # A = T^T M T and b = T^T h: the axes turn with the pairs, so T is constant.
+    terms[A00] = matrix[0, 0] + 2.0 * matrix[0, 2] + matrix[2, 2]
+    terms[A01] = matrix[0, 1] + matrix[0, 3] + matrix[2, 1] + matrix[2, 3]
+    terms[A11] = matrix[1, 1] + 2.0 * matrix[1, 3] + matrix[3, 3]
+    inertia = 0.0
+    for row in range(3):
+        bias[row] = (rows[row, 0] * h[0] + rows[row, 1] * h[1] + rows[row, 2] * h[2]
+                     + rows[row, 3] * h[3])
+    for i in range(4):
+        for k in range(4):
+            inertia += rows[2, i] * matrix[i, k] * rows[2, k]
+    terms[BRANCH_INERTIA], terms[HOLD] = inertia, hold_on_branch(theta)
+    angle = rate = 0.0
+    for link in range(4):
+        angle += rows[2, link] * (angles[link] - reference_angles[link])
+        rate += rows[2, link] * (rates[link] - reference_rates[link])
+    terms[BRANCH_ANGLE], terms[BRANCH_RATE] = angle, rate
+    for axis in range(2):
+        errors[0, axis] = 0.5 * (reference_angles[axis] - angles[axis]
+                                 + reference_angles[axis + 2] - angles[axis + 2])
+        errors[1, axis] = 0.5 * (reference_rates[axis] - rates[axis]
+                                 + reference_rates[axis + 2] - rates[axis + 2])
+
+
+@kernel
+def demanded(acceleration: Array, errors: Array, stiffness: float, damping: float, band: float,
+             disturbance: Array, sticking: float, bias: Array, terms: Array, demand: Array
+             ) -> None:
+    """
+    Evaluate the tracking law: the generalized forces `A du + b` that the wheels are to give.
+
+    The error is taken apart into that of the attitude, which turns the whole without turning the
+    joints, and that of the configuration. At rest dry friction in the joints holds the
+    configuration by itself: there errors within `band` do nothing, and what friction was
+    estimated to do is not worked against, or it would be taken for a disturbance that grows with
+    what the wheels give.
+
+    :param acceleration: (2,) of the reference [rad/s^2].
+    :param errors: (2, 2) of angles [rad] and rates [rad/s].
+    :param stiffness, damping: of the law [1/s^2], [1/s].
+    :param band: of the configuration [rad].
+    :param disturbance: (2,) estimated torques on the axes that are to be compensated [N m].
+    :param sticking: from 0, in motion, to 1, at rest.
+    :param demand: (3,) receives it; of eta only what its inertia needs.
+    """
+    a00, a01, a11 = terms[A00], terms[A01], terms[A11]
+    total = a00 + 2.0 * a01 + a11
+    first, second = (a00 + a01) / total, (a01 + a11) / total
+    attitude = first * errors[0, 0] + second * errors[0, 1]
+    theta = errors[0, 1] - errors[0, 0]
+    width = band * sticking
+    theta = max(theta - width, 0.0) + min(theta + width, 0.0)
+    u0 = acceleration[0] + damping * errors[1, 0] + stiffness * (attitude - second * theta)
+    u1 = acceleration[1] + damping * errors[1, 1] + stiffness * (attitude + first * theta)
+    whole = disturbance[0] + disturbance[1]
+    between = (disturbance[1] - second * whole) * (1.0 - sticking)
+    demand[0] = a00 * u0 + a01 * u1 + bias[0] - first * whole + between
+    demand[1] = a01 * u0 + a11 * u1 + bias[1] - second * whole - between
+    demand[2] = bias[2]

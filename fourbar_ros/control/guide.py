@@ -1,0 +1,181 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Where the links should be: the reference and the move that it is on."""
+
+from __future__ import annotations
+
+from math import pi
+
+from fourbar_ros.control.reference import SoftStep, Way
+from fourbar_ros.control.setpoint import follow, on_parallelogram, SetpointError
+from fourbar_ros.mechanism import Mechanism, nearest_assembly
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.dynamics import gamma_matrix
+import numpy as np
+
+# A move that is given up comes to rest in this time, and so does one that begins in motion [s].
+STOPPING_TIME = 1.0
+# The distance that it takes, in rate times time: of a quintic that ends at rest and overshoots
+# nowhere.
+STOPPING_SHARE = 0.5
+
+
+class Guide:
+    """
+    The reference of all four links.
+
+    :param mechanism: the linkage that the controller believes in.
+    :ivar angles: (4,) continuous [rad].
+    :ivar rates: (4,) [rad/s].
+    :ivar accelerations: (4,) of a and b; c and d follow but for what their change of gearing adds
+        [rad/s^2].
+    :ivar goal: (4,) where the last accepted move ends, None without one [rad].
+    :ivar parallel: whether it is on the parallelogram branch, where opposite links stay parallel.
+    """
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        self.angles = np.zeros(4)
+        self.rates = np.zeros(4)
+        self.accelerations = np.zeros(4)
+        self.goal: Array | None = None
+        self.parallel = False
+        self._mechanism = mechanism
+        self._motion = np.zeros((3, 2))
+        self._offsets = np.zeros(2)
+        self._way: Way | None = None
+        self._start_ns = 0
+
+    @property
+    def motion(self) -> Array:
+        """Angle, rate and acceleration of (phi_a, phi_b) now (3, 2) [rad, rad/s, rad/s^2]."""
+        return self._motion
+
+    @property
+    def moving(self) -> bool:
+        """Whether a move is under way."""
+        return self._way is not None
+
+    @property
+    def destination(self) -> Array:
+        """Where the links are going, or are (4,) [rad]."""
+        return self.angles if self._way is None or self.goal is None else self.goal
+
+    def begin(self, angles: Array) -> None:
+        """
+        Stand where the links are, without a goal.
+
+        :param angles: (4,) [rad].
+        """
+        self._way = self.goal = None
+        self.parallel = on_parallelogram(self._mechanism, angles)
+        self._motion[0], self._motion[1:] = angles[:2], 0.0
+        self.rates[:] = self.accelerations[:] = 0.0
+        self.angles = np.array(angles)
+        if self.parallel:
+            # Nearest to all four, on whatever turns they are.
+            apart = angles[2:] - angles[:2]
+            self._offsets = 2.0 * pi * np.round(apart / (2.0 * pi))
+            self._motion[0] += 0.5 * (apart - self._offsets)
+            self._spread()
+
+    def stand_at(self, angles: Array) -> None:
+        """Be where the links are, as long as nothing drives them (4,) [rad]."""
+        self._way = None
+        self.angles[:] = angles
+        self._motion[0], self._motion[1:] = angles[:2], 0.0
+        self.rates[:] = self.accelerations[:] = 0.0
+
+    def go(self, way: Way, goal: Array, start_ns: int) -> None:
+        """
+        Begin a move.
+
+        :param way: from the present motion.
+        :param goal: (4,) where it ends [rad].
+        :param start_ns: when [ns].
+        """
+        self._way, self.goal, self._start_ns = way, goal, start_ns
+
+    def halt(self, start_ns: int) -> None:
+        """Give up a move and come to rest soon, without a jump of the reference."""
+        self.goal = None
+        if self._way is None and not self._motion[1:].any():
+            return
+        time = STOPPING_TIME
+        while time > 0.05:
+            stop = SoftStep(
+                self._motion.copy(), self._motion[0] + STOPPING_SHARE * time * self._motion[1],
+                time)
+            try:
+                end = follow(self._mechanism, stop, self.angles, crossing=self.parallel)[-1]
+            except SetpointError:
+                # A change point is nearer than that.
+                time *= 0.5
+                continue
+            self.go(stop, end, start_ns)
+            return
+        self._way = None
+        self._motion[1:] = 0.0
+        self.rates[:] = self.accelerations[:] = 0.0
+
+    def move_from(self, angles: Array, rates: Array, start_ns: int) -> None:
+        """
+        Take over the links as they move, and bring them to rest.
+
+        :param angles, rates: (4,) [rad], [rad/s].
+        """
+        self.begin(angles)
+        self._motion[1] = rates[:2]
+        self.halt(start_ns)
+        self.goal = None
+
+    def follow(self, stamp_ns: int) -> bool:
+        """
+        Go on to a tick.
+
+        :returns: whether a move has just ended.
+        """
+        way = self._way
+        if way is None:
+            return False
+        elapsed = (stamp_ns - self._start_ns) * 1e-9
+        self._motion[:] = way.at(elapsed)
+        if self.parallel:
+            self._spread()
+        else:
+            self._close()
+        if elapsed >= way.duration:
+            self._way = None
+            return True
+        return False
+
+    def time_left(self, stamp_ns: int) -> float:
+        """Return how long the move still takes [s]."""
+        way = self._way
+        return 0.0 if way is None else way.duration - (stamp_ns - self._start_ns) * 1e-9
+
+    def _spread(self) -> None:
+        for row, values in enumerate((self.angles, self.rates, self.accelerations)):
+            values[:2] = values[2:] = self._motion[row]
+        self.angles[2:] += self._offsets
+
+    def _close(self) -> None:
+        motion = self._motion
+        self.angles = nearest_assembly(
+            self._mechanism, (0, 1), (motion[0, 0], motion[0, 1]), self.angles)
+        # A planned move keeps its distance from change points, so Gamma exists here.
+        gamma = gamma_matrix(self.angles, self._mechanism.link_lengths)
+        for values, given in ((self.rates, motion[1]), (self.accelerations, motion[2])):
+            values[:2] = given
+            values[2:] = gamma @ given

@@ -1,0 +1,341 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Which wheels still do what they are told: command against measured speed and effort.
+
+Beside each wheel runs a model of a healthy one under the same commands. What the wheel does not
+follow adds up to a difference of speeds, and a large one means that it is broken; what the motor
+says that it gives, and what the wheel makes of it, tell how. Smaller faults, with which a wheel is
+still of use, show as torque that is lost on the way from command to effort or from effort to
+acceleration, or as a motor that acts late.
+"""
+
+from __future__ import annotations
+
+from math import copysign, exp, inf, nan
+
+from fourbar_ros.mechanism import FLYWHEEL_NAMES, Mechanism
+from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.motors import (
+    available_torque,
+    lagged_torque,
+    motors_of,
+    SPEED_BANDWIDTH,
+    speed_loop,
+)
+import numpy as np
+from numpy.typing import NDArray
+
+VERDICTS = ('healthy', 'degraded', 'dead', 'stuck', 'runaway', 'shorted')
+"""What may be said of a wheel; the number in arrays is the index. From `dead` on it is out."""
+
+HEALTHY, DEGRADED, DEAD, STUCK, RUNAWAY, SHORTED = range(len(VERDICTS))
+
+# A wheel that is so much faster or slower than it should be [rad/s], for so many ticks in a row,
+# is broken or degraded.
+UNFOLLOWED = 2.5
+UNFOLLOWED_TICKS = 4
+
+# Time constants of means [s]: for a wheel that breaks, and for one that degrades; with which a
+# healthy one is learnt, and the model of a wheel that is driven by torque led back to it, since
+# errors of the friction add up there.
+SHORT, LONG, SLOW = 0.02, 0.5, 5.0
+
+# In shares of the motor's torque limit: degradation is looked at from this effort on; torque that
+# friction takes; a motor that gives nothing; one that gives what nobody asked for; a brake.
+LOOKED_AT, FRICTION_LOSS, NOTHING, UNASKED, BRAKED = 0.04, 1e-3, 2e-3, 0.04, 0.1
+
+# Shares of the expected torque: that of a dead motor at most, and what a healthy one may lack; of
+# the measured change of torque, by how much the inertia of a wheel may be believed wrongly.
+DEAD_SHARE, MISSING, INERTIA_ERROR = 0.15, 0.2, 0.08
+
+# A wheel that follows speeds is late if it is so far behind on the mean [rad/s]; one that follows
+# torques, if some delay explains its effort better than none by this factor, in squares, and the
+# difference is more than this share of the limit.
+BEHIND, EXPLAINED_BETTER, VISIBLE = 0.35, 4.0, 5e-4
+
+# Degradation must last so long to be said [s].
+PERSISTENT = 0.5
+
+# The friction of slower wheels is not known [rad/s], nor that of one which was slow so lately [s].
+SLOWEST, AFTER_SLOW = 5.0, 1.5
+
+# At most this slow, a wheel that is pushed stands still [rad/s].
+STANDING = 1.0
+
+# A wheel without power that is driven after so long cannot be cut [s].
+CUT_WITHIN = 0.15
+
+# Delays of commands that are thought of, in ticks: from the first to the last.
+FIRST_DELAY, DELAYS = 3, 32
+
+# Longest step of the model [s].
+STEP = 1e-3
+
+# What is kept of each wheel.
+(MODEL_SPEED, MODEL_TORQUE, INTEGRAL, LAST_SPEED, LAST_RATE, AGAINST, EFFORT, EXPECTED, GAIN,
+ LONG_EFFORT, LONG_EXPECTED, LONG_GAIN, LONG_BEHIND, LEARNT, LEARNT_GAIN, REPLICA, REPLICA_TORQUE,
+ SUSPECT_FOR, FAST_FOR, CUT_FOR, KNOWN) = range(21)
+COLUMNS = 21
+
+
+class WheelWatch:
+    """
+    Watches the four wheels.
+
+    :param mechanism: the linkage, its wheels and motors.
+    :ivar verdicts: (4,) what is the matter with each wheel, as index of `VERDICTS`.
+    :ivar usable: (4,) bool, which wheels can be driven; a new array when that changes.
+    """
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        self.verdicts = np.zeros(4, np.int64)
+        self.usable = np.ones(4, dtype=bool)
+        self._motors = np.array([motors_of(mechanism)])
+        self._kept = np.zeros((4, COLUMNS))
+        self._past = np.zeros((4, DELAYS))
+        self._late = np.zeros((4, DELAYS))
+        self._started = False
+
+    def begin(self) -> None:
+        """Think well of all wheels, and know nothing of them."""
+        self.verdicts[:] = HEALTHY
+        self.usable = np.ones(4, dtype=bool)
+        self._started = False
+
+    def look(self, period: float, commands: Array, by_speed: bool, powered: NDArray[np.bool_],
+             speeds: Array, link_rates: Array, efforts: Array, friction: Array) -> bool:
+        """
+        Look at what the wheels did in a period.
+
+        :param period: its length [s].
+        :param commands: (4,) torques [N m] or speeds [rad/s] that were commanded for it.
+        :param by_speed: which of both.
+        :param powered: (4,) which wheels had power.
+        :param speeds: (4,) measured, relative to the links, mean of the period [rad/s].
+        :param link_rates: (4,) of the links at its end [rad/s].
+        :param efforts: (4,) that the motors say they gave, mean of the period [N m].
+        :param friction: (2,) of the bearings: Coulomb [N m] and viscous [N m s].
+        :returns: whether a verdict has changed.
+        """
+        if not self._started:
+            _begin(self._kept, self._past, self._late, speeds, link_rates)
+            self._started = True
+            return False
+        changed = look_at_wheels(
+            period, commands, by_speed, powered, speeds, link_rates, efforts, friction,
+            self._motors, self._kept, self._past, self._late, self.verdicts)
+        if changed:
+            self.usable = self.verdicts < DEAD
+        return bool(changed)
+
+    def findings(self) -> dict[str, str]:
+        """Return what is the matter, by the name of the wheel; nothing if all are healthy."""
+        return {name: VERDICTS[verdict] for name, verdict in zip(
+            FLYWHEEL_NAMES, self.verdicts.tolist()) if verdict}
+
+
+@kernel
+def _begin(kept: Array, past: Array, late: Array, speeds: Array, rates: Array) -> None:
+    kept[:], past[:], late[:] = 0.0, 0.0, 0.0
+    for j in range(4):
+        kept[j, MODEL_SPEED] = kept[j, LAST_SPEED] = speeds[j]
+        kept[j, LAST_RATE] = rates[j]
+        kept[j, INTEGRAL] = kept[j, REPLICA] = nan
+
+
+@kernel
+def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDArray[np.bool_],
+                   speeds: Array, rates: Array, efforts: Array, friction: Array,
+                   boxed: NDArray[np.record], kept: Array, past: Array, late: Array,
+                   verdicts: NDArray[np.int64]) -> bool:
+    """
+    Look at the wheels, see :meth:`WheelWatch.look`.
+
+    :param kept: (4, COLUMNS) of each wheel.
+    :param past: (4, DELAYS) torques that were asked for, newest first [N m].
+    :param late: (4, DELAYS) mean squares of effort less these [N^2 m^2].
+    """
+    motors, changed = boxed[0], False
+    short, long = 1.0 - exp(-period / SHORT), 1.0 - exp(-period / LONG)
+    for j in range(4):
+        wheel, before = kept[j], verdicts[j]
+        inertia, limit = motors.inertia[j], motors.torque_limit[j]
+        speed, turned = speeds[j], rates[j] - wheel[LAST_RATE]
+        gain = inertia * (speed - wheel[LAST_SPEED] + turned) / period
+        wheel[LAST_SPEED], wheel[LAST_RATE] = speed, rates[j]
+        wheel[EFFORT] += short * (efforts[j] - wheel[EFFORT])
+        wheel[GAIN] += short * (gain - wheel[GAIN])
+        if not powered[j]:
+            _without_power(wheel, speed, period)
+            if verdicts[j] == RUNAWAY and wheel[CUT_FOR] > CUT_WITHIN:
+                # Friction brakes it: anything else is driven.
+                driven = copysign(1.0, speed) * wheel[GAIN] > 0.0
+                if driven and abs(wheel[GAIN]) > 0.5 * UNASKED * limit:
+                    verdicts[j] = SHORTED
+            changed |= verdicts[j] != before
+            continue
+        wheel[CUT_FOR] = 0.0
+        asked, behind = _follow_model(
+            j, wheel, commands[j], by_speed, speed, turned, period, friction, boxed)
+        wheel[EXPECTED] += short * (asked - wheel[EXPECTED])
+        wheel[AGAINST] = wheel[AGAINST] + 1.0 if abs(behind) > UNFOLLOWED else 0.0
+        if wheel[AGAINST] >= UNFOLLOWED_TICKS:
+            verdicts[j] = max(before, _broken(wheel, speed, limit, friction))
+            wheel[MODEL_SPEED], wheel[AGAINST] = speed, 0.0
+        if verdicts[j] == HEALTHY and _degraded(
+                j, wheel, asked, by_speed, speed, behind, efforts[j], gain, commands[j], period,
+                long, friction, boxed, past[j], late[j]):
+            verdicts[j] = DEGRADED
+        changed |= verdicts[j] != before
+    return changed
+
+
+@kernel
+def _without_power(wheel: Array, speed: float, period: float) -> None:
+    wheel[MODEL_SPEED], wheel[MODEL_TORQUE], wheel[EXPECTED] = speed, 0.0, 0.0
+    wheel[INTEGRAL] = wheel[REPLICA] = nan
+    wheel[AGAINST] = wheel[SUSPECT_FOR] = wheel[FAST_FOR] = 0.0
+    wheel[CUT_FOR] += period
+
+
+@kernel
+def _follow_model(j: int, wheel: Array, command: float, by_speed: bool, speed: float,
+                  turned: float, period: float, friction: Array, boxed: NDArray[np.record]
+                  ) -> tuple[float, float]:
+    """
+    Let a healthy wheel do what this one was told.
+
+    :param turned: what the link's rate gained [rad/s].
+    :returns: its mean torque [N m], and measured speed less its mean speed [rad/s].
+    """
+    motors = boxed[0]
+    inertia = motors.inertia[j]
+    steps = int(period / STEP) + 1
+    h = period / steps
+    model, torque = wheel[MODEL_SPEED], wheel[MODEL_TORQUE]
+    total = mean_speed = 0.0
+    for _ in range(steps):
+        asked = command
+        if by_speed:
+            asked, wheel[INTEGRAL] = speed_loop(j, command, model, wheel[INTEGRAL], h, motors)
+        mean, torque = lagged_torque(
+            j, torque, available_torque(j, asked, model, motors), h, motors)
+        free = model + h * mean / inertia - turned * h / period
+        # Dry friction stops it at most.
+        left = abs(free) * (1.0 - h * friction[1] / inertia) - h * friction[0] / inertia
+        after = copysign(max(left, 0.0), free)
+        total += mean / steps
+        mean_speed += 0.5 * (model + after) / steps
+        model = after
+    behind = speed - mean_speed
+    if not by_speed:
+        model += behind * period / SLOW
+    wheel[MODEL_SPEED], wheel[MODEL_TORQUE] = model, torque
+    return total, behind
+
+
+@kernel
+def _broken(wheel: Array, speed: float, limit: float, friction: Array) -> int:
+    """Tell what is the matter with a wheel that does not follow."""
+    effort, expected = wheel[EFFORT], wheel[EXPECTED]
+    if abs(effort) < DEAD_SHARE * abs(expected) + NOTHING * limit:
+        return DEAD
+    taken = copysign(friction[0], speed) + friction[1] * speed if abs(speed) > STANDING else 0.0
+    lost = effort - taken - wheel[GAIN]
+    dry = friction[0]
+    if abs(lost) > max(5.0 * dry, BRAKED * limit) or (
+            abs(speed) < STANDING and abs(effort) > 3.0 * dry + NOTHING * limit
+            and abs(lost) > 0.5 * abs(effort)):
+        return STUCK
+    unasked = abs(effort - expected) > UNASKED * limit + 0.5 * abs(expected)
+    if unasked and (effort * expected < 0.0 or abs(effort) > 1.3 * abs(expected)):
+        return RUNAWAY
+    return DEGRADED
+
+
+@kernel
+def _degraded(j: int, wheel: Array, asked: float, by_speed: bool, speed: float, behind: float,
+              effort: float, gain: float, command: float, period: float, long: float,
+              friction: Array, boxed: NDArray[np.record], past: Array, late: Array) -> bool:
+    """Tell whether a wheel lacks torque or acts late, for long enough to say so."""
+    motors = boxed[0]
+    limit = motors.torque_limit[j]
+    if by_speed:
+        asked = _replicate(j, wheel, command, speed, effort, period, boxed)
+    for delay in range(DELAYS - 1, 0, -1):
+        past[delay] = past[delay - 1]
+    past[0] = asked
+    wheel[LONG_EFFORT] += long * (effort - wheel[LONG_EFFORT])
+    wheel[LONG_EXPECTED] += long * (asked - wheel[LONG_EXPECTED])
+    wheel[LONG_GAIN] += long * (gain - wheel[LONG_GAIN])
+    wheel[LONG_BEHIND] += long * (behind - wheel[LONG_BEHIND])
+    best = inf
+    for delay in range(DELAYS):
+        error = effort - past[delay]
+        late[delay] += long * (error * error - late[delay])
+        if delay >= FIRST_DELAY:
+            best = min(best, late[delay])
+    wheel[FAST_FOR] = wheel[FAST_FOR] + period if abs(speed) > SLOWEST else 0.0
+    missing = abs(wheel[LONG_EXPECTED] - wheel[LONG_EFFORT]) > (
+        MISSING * abs(wheel[LONG_EXPECTED]) + NOTHING * limit)
+    if by_speed:
+        tardy = abs(wheel[LONG_BEHIND]) > BEHIND
+    else:
+        tardy = late[0] > max(EXPLAINED_BETTER * best, (VISIBLE * limit) ** 2)
+    rubbing = wheel[FAST_FOR] > AFTER_SLOW and _rubs(wheel, speed, limit, period, friction)
+    looked_at = max(abs(wheel[LONG_EFFORT]), abs(wheel[LONG_EXPECTED])) > LOOKED_AT * limit
+    if looked_at and (missing or tardy or rubbing):
+        wheel[SUSPECT_FOR] += period
+    else:
+        wheel[SUSPECT_FOR] = 0.0
+    return bool(wheel[SUSPECT_FOR] > PERSISTENT)
+
+
+@kernel
+def _rubs(wheel: Array, speed: float, limit: float, period: float, friction: Array) -> bool:
+    """Tell whether friction takes more than it used to, and learn what it is used to."""
+    lost = (wheel[LONG_EFFORT] - wheel[LONG_GAIN]) * copysign(1.0, speed) - (
+        friction[0] + friction[1] * abs(speed))
+    accelerated = wheel[LONG_GAIN] * copysign(1.0, speed)
+    if wheel[KNOWN] == 0.0:
+        wheel[LEARNT], wheel[LEARNT_GAIN], wheel[KNOWN] = lost, accelerated, 1.0
+    allowed = FRICTION_LOSS * limit + INERTIA_ERROR * abs(accelerated - wheel[LEARNT_GAIN])
+    if lost - wheel[LEARNT] > allowed:
+        return True
+    share = period / SLOW
+    wheel[LEARNT] += share * (lost - wheel[LEARNT])
+    wheel[LEARNT_GAIN] += share * (accelerated - wheel[LEARNT_GAIN])
+    return False
+
+
+@kernel
+def _replicate(j: int, wheel: Array, command: float, speed: float, effort: float, period: float,
+               boxed: NDArray[np.record]) -> float:
+    """
+    Return what the motor's electronics ask for, seeing this command and this speed [N m].
+
+    Led back slowly to what the motor gives, or the rounding of the speeds would add up.
+    """
+    motors = boxed[0]
+    limit = motors.torque_limit[j]
+    if not abs(wheel[REPLICA]) <= limit:
+        wheel[REPLICA] = effort - SPEED_BANDWIDTH * motors.inertia[j] * (command - speed)
+    asked, wheel[REPLICA] = speed_loop(j, command, speed, wheel[REPLICA], period, motors)
+    wheel[REPLICA] += (effort - asked) * period / SLOW
+    mean, wheel[REPLICA_TORQUE] = lagged_torque(
+        j, wheel[REPLICA_TORQUE], asked, period, motors)
+    return mean
