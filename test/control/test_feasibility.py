@@ -43,7 +43,7 @@ from fourbar_ros.mechanism import (
 from fourbar_ros.plant import InitialState, Plant, Table
 from fourbar_ros.mechanism.motors import available_torque, motors_of
 from fourbar_ros.plant.sensors import LinkSensorSettings
-from fourbar_ros.plant.table import WheelBearings, WheelEncoders
+from fourbar_ros.plant.table import WheelEncoders
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -300,7 +300,7 @@ def test_at_the_shortest_duration_a_limit_is_met_and_below_it_is_broken(
 def test_supply_covers_what_the_motors_of_the_plant_are_asked_for(prototype: Mechanism) -> None:
     """The law of the plant: at the shortest duration it cuts nothing off, 2 % below it does."""
     weak = replace(prototype, motor_voltages=np.full(4, 3.0))
-    motors = motors_of(weak, WheelBearings())
+    motors = motors_of(weak)
     wheels = fresh(weak)
     way = quarter_turn(1.0)
     shortest = shortest_duration(
