@@ -23,7 +23,12 @@ from math import exp, pi, sin
 from fourbar_ros.control.accounts import Accounts, LONGEST_PERIOD
 from fourbar_ros.control.allocation import mobilities
 from fourbar_ros.control.drive import WheelCommand, WheelDrive
-from fourbar_ros.control.feasibility import check_needs, shortest_duration, Wheels
+from fourbar_ros.control.feasibility import (
+    check_needs,
+    shortest_duration,
+    wheel_loads,
+    Wheels,
+)
 from fourbar_ros.control.guide import Guide
 from fourbar_ros.control.law import TrackingLaw
 from fourbar_ros.control.momentum import MomentumWatch
@@ -460,7 +465,10 @@ class Controller:
         self._accounts.book(0.0, none, none, none)
         move = SoftStep(np.zeros((3, 2)), np.zeros(2), 1.0)
         move.at(0.5)
-        check_needs(self.mechanism, move, square, Wheels(none, self.law.mobilities))
+        # Not by `check_needs`: not every linkage closes with all angles the same.
+        times = move.instants(2)
+        wheel_loads(times, np.tile(square, (2, 1)), move.sample(times)[:, 1:],
+                    self._guide.parallel, self.law.mobilities, np.array([self.mechanism.constants]))
 
 
 def _bearings_of(settings: ControllerSettings) -> Array:
