@@ -38,8 +38,9 @@ FULL_HOLD = 0.15
 NO_HOLD = 0.35
 
 # Numbers that the kernels hand over in `terms`.
-A00, A01, A11, BRANCH_INERTIA, BRANCH_ANGLE, BRANCH_RATE, HOLD, CONDITION = range(8)
-TERMS = 8
+(A00, A01, A11, BRANCH_A, BRANCH_B, BRANCH_INERTIA, BRANCH_ANGLE, BRANCH_RATE, HOLD,
+ CONDITION) = range(10)
+TERMS = 10
 
 
 @kernel
@@ -64,8 +65,9 @@ def axes_of(angles: Array, rates: Array, reference_angles: Array, reference_rate
     :param rows: (3, 4) receives G, and the row of eta where opposite links are parallel.
     :param errors: (2, 2) receives reference minus estimate, angles [rad] and rates [rad/s].
     :param bias: (3,) receives b, and that of eta [N m].
-    :param terms: (TERMS,) receives A, and what is known of eta: its inertia [kg m^2], angle [rad]
-        and rate [rad/s] beside the reference, how much it is to be held, and cond(A).
+    :param terms: (TERMS,) receives A, and what is known of eta: how its inertia is coupled to the
+        axes, and that itself [kg m^2], its angle [rad] and rate [rad/s] beside the reference, how
+        much it is to be held; and cond(A).
     """
     constants = boxed[0]
     if parallel:
@@ -78,7 +80,7 @@ def axes_of(angles: Array, rates: Array, reference_angles: Array, reference_rate
         rows[2] = 0.0
         bias[0], bias[1], bias[2] = b0, b1, 0.0
         terms[A00], terms[A01], terms[A11] = a00, a01, a11
-        terms[BRANCH_INERTIA:] = 0.0
+        terms[BRANCH_A:] = 0.0
         for axis in range(2):
             errors[0, axis] = reference_angles[axis] - angles[axis]
             errors[1, axis] = reference_rates[axis] - rates[axis]
@@ -95,9 +97,11 @@ def _parallel_axes(angles: Array, rates: Array, reference_angles: Array, referen
     constants = boxed[0]
     theta = 0.5 * (angles[1] + angles[3] - angles[0] - angles[2])
     sign = 1.0 if cos(theta) >= 0.0 else -1.0
+    # In line, the closure leaves free what turns c and d apart from a and b by inverse lengths.
+    gearing = sign * constants.lengths[0] / constants.lengths[1]
     rows[:] = 0.0
     rows[0, 0] = rows[0, 2] = rows[1, 1] = rows[1, 3] = 1.0
-    rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3] = -0.5, -0.5 * sign, 0.5, 0.5 * sign
+    rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3] = -0.5, -0.5 * gearing, 0.5, 0.5 * gearing
     matrix = mass_matrix(angles, constants)
     cosines, sines = directions((angles[0], angles[1], angles[2], angles[3]))
     _, h = factored_inertia(
@@ -106,19 +110,21 @@ def _parallel_axes(angles: Array, rates: Array, reference_angles: Array, referen
     terms[A00] = matrix[0, 0] + 2.0 * matrix[0, 2] + matrix[2, 2]
     terms[A01] = matrix[0, 1] + matrix[0, 3] + matrix[2, 1] + matrix[2, 3]
     terms[A11] = matrix[1, 1] + 2.0 * matrix[1, 3] + matrix[3, 3]
-    inertia = 0.0
     for row in range(3):
         bias[row] = (rows[row, 0] * h[0] + rows[row, 1] * h[1] + rows[row, 2] * h[2]
                      + rows[row, 3] * h[3])
-    for i in range(4):
-        for k in range(4):
-            inertia += rows[2, i] * matrix[i, k] * rows[2, k]
-    terms[BRANCH_INERTIA], terms[HOLD] = inertia, hold_on_branch(theta)
+        coupled = 0.0
+        for i in range(4):
+            for k in range(4):
+                coupled += rows[row, i] * matrix[i, k] * rows[2, k]
+        terms[BRANCH_A + row] = coupled
+    terms[HOLD] = hold_on_branch(theta)
     angle = rate = 0.0
     for link in range(4):
         angle += rows[2, link] * (angles[link] - reference_angles[link])
         rate += rows[2, link] * (rates[link] - reference_rates[link])
-    terms[BRANCH_ANGLE], terms[BRANCH_RATE] = angle, rate
+    size = 0.5 * (1.0 + gearing * gearing)
+    terms[BRANCH_ANGLE], terms[BRANCH_RATE] = angle / size, rate / size
     for axis in range(2):
         errors[0, axis] = 0.5 * (reference_angles[axis] - angles[axis]
                                  + reference_angles[axis + 2] - angles[axis + 2])
@@ -145,7 +151,7 @@ def demanded(acceleration: Array, errors: Array, stiffness: float, damping: floa
     :param band: of the configuration [rad].
     :param disturbance: (2,) estimated torques on the axes that are to be compensated [N m].
     :param sticking: from 0, in motion, to 1, at rest.
-    :param demand: (3,) receives it; of eta only what its inertia needs.
+    :param demand: (3,) receives it; for eta what keeps it from accelerating.
     """
     a00, a01, a11 = terms[A00], terms[A01], terms[A11]
     total = a00 + 2.0 * a01 + a11
@@ -160,4 +166,4 @@ def demanded(acceleration: Array, errors: Array, stiffness: float, damping: floa
     between = (disturbance[1] - second * whole) * (1.0 - sticking)
     demand[0] = a00 * u0 + a01 * u1 + bias[0] - first * whole + between
     demand[1] = a01 * u0 + a11 * u1 + bias[1] - second * whole - between
-    demand[2] = bias[2]
+    demand[2] = terms[BRANCH_A] * u0 + terms[BRANCH_B] * u1 + bias[2]

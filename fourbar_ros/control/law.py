@@ -21,7 +21,9 @@ from dataclasses import dataclass, field
 from fourbar_ros.control.allocation import allocate, controllable, mobilities
 from fourbar_ros.control.axes import (
     axes_of,
+    BRANCH_A,
     BRANCH_ANGLE,
+    BRANCH_B,
     BRANCH_INERTIA,
     BRANCH_RATE,
     demanded,
@@ -139,9 +141,11 @@ def decide(angles: Array, rates: Array, reference_angles: Array, reference_rates
         present = 0.0
         for j in range(4):
             present += rows[2, j] * torques[j]
-        asked = bias[2] - terms[BRANCH_INERTIA] * (
-            numbers[BRANCH_STIFFNESS] * terms[BRANCH_ANGLE]
-            + numbers[BRANCH_DAMPING] * terms[BRANCH_RATE])
+        eta = -(numbers[BRANCH_STIFFNESS] * terms[BRANCH_ANGLE]
+                + numbers[BRANCH_DAMPING] * terms[BRANCH_RATE])
+        asked = demand[2] + terms[BRANCH_INERTIA] * eta
+        demand[0] += hold * terms[BRANCH_A] * eta
+        demand[1] += hold * terms[BRANCH_B] * eta
         demand[2] = hold * asked - (1.0 - hold) * present
         scale = allocate(rows, demand, mobilities, lower, upper, bounded, torques)
     if numbers[WHEEL_BANDWIDTH] > 0.0:
