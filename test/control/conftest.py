@@ -21,6 +21,8 @@ from dataclasses import replace
 
 from fourbar_ros.control import Control, Controller, ControllerSettings
 from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism
+from fourbar_ros.mechanism.closure import SIGNS
+from fourbar_ros.mechanism.dynamics import mass_matrix
 from fourbar_ros.plant import InitialState, Plant, Table
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelEncoders
@@ -32,6 +34,27 @@ Array = NDArray[np.float64]
 PERIOD_NS = 4_000_000
 PLANT_STEP = 5e-4
 IDEAL = Table(LinkSensorSettings(), WheelEncoders(0))
+
+
+def link_accelerations(mechanism: Mechanism, angles: Array, rates: Array, wheel_torques: Array
+                       ) -> Array:
+    """
+    Solve the equations of motion of all four links with joint forces as unknowns (4,) [rad/s^2].
+
+    `M alpha - J^T lambda = -tau - h`, `J alpha = sum s_i l_i omega_i^2 e_i` (docs/mechanics.md).
+    At a change point J has one row less, and eta is free.
+    """
+    constants = mechanism.constants
+    apart = angles[None, :] - angles[:, None]
+    bias = (constants.sine * np.cos(apart) - constants.cosine * np.sin(apart)) @ rates ** 2
+    arms = np.array(SIGNS) * mechanism.link_lengths
+    along, across = arms * np.cos(angles), arms * np.sin(angles)
+    jacobian = np.array([-across, along])
+    matrix = np.block([[mass_matrix(angles, constants), -jacobian.T],
+                       [jacobian, np.zeros((2, 2))]])
+    right = np.concatenate([-wheel_torques - bias, np.array([along, across]) @ rates ** 2])
+    found: Array = np.linalg.lstsq(matrix, right, rcond=1e-11)[0][:4]
+    return found
 
 
 class Driven:
@@ -143,3 +166,9 @@ def parallelogram() -> Mechanism:
         [0.12, 0.08, 0.12, 0.08], [0.02, 0.03, 0.025, 0.018], [2.2e-5, 1.5e-5, 3e-5, 1.8e-5],
         [[0.05, 0.01], [0.04, -0.01], [0.06, 0.005], [0.05, 0.0]], [3e-7, 4e-7, 5e-7, 2e-7],
         [1e-4] * 4, [500.0] * 4)
+
+
+@pytest.fixture(scope='session')
+def accelerations() -> Callable[[Mechanism, Array, Array, Array], Array]:
+    """Return `link_accelerations`."""
+    return link_accelerations

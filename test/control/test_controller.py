@@ -33,7 +33,7 @@ from fourbar_ros.control.controller import NO_HOLD
 from fourbar_ros.control.guide import STOPPING_TIME
 from fourbar_ros.control.law import SHARED_OUT
 from fourbar_ros.mechanism import assemble, kinetic_energy, Mechanism
-from fourbar_ros.mechanism.angles import wrap
+from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.plant import InitialState
 import numpy as np
 from numpy.typing import NDArray
@@ -279,7 +279,7 @@ def test_at_a_change_point_of_the_parallelogram_it_holds(
     steered.ticks(round((10.0 + 3.0) / PERIOD))
     truth = steered.plant.truth()
     # Three seconds are more than ten time constants of the law.
-    assert np.abs(wrap(truth.link_angles - np.array([0.1, 0.1 + theta] * 2))).max() < 1e-4
+    assert np.abs(wrap_angles(truth.link_angles - np.array([0.1, 0.1 + theta] * 2))).max() < 1e-4
     assert np.abs(truth.link_rates).max() < 1e-4
     assert not steered.controller.wheels.findings()
 

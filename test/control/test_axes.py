@@ -1,0 +1,285 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Terms of paper eq. 6 on axes that exist at change points too, and what errors ask of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+
+from fourbar_ros.control.axes import (
+    A00,
+    A01,
+    A11,
+    axes_of,
+    BRANCH_A,
+    BRANCH_ANGLE,
+    BRANCH_B,
+    BRANCH_INERTIA,
+    BRANCH_RATE,
+    CONDITION,
+    demanded,
+    FULL_HOLD,
+    HOLD,
+    hold_on_branch,
+    NO_HOLD,
+    TERMS,
+)
+from fourbar_ros.mechanism import assemble, kinetic_energy, Mechanism, reduced_form
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+
+SEEDS = range(20)
+NONE = np.zeros(4)
+PARALLELOGRAMS = ('paper', 'prototype', 'parallelogram')
+
+each_seed = pytest.mark.parametrize('seed', SEEDS)
+each_parallelogram = pytest.mark.parametrize('linkage', PARALLELOGRAMS)
+
+
+@dataclass
+class Axes:
+    """What `axes_of` fills in."""
+
+    rows: Array
+    errors: Array
+    bias: Array
+    terms: Array
+
+    @property
+    def matrix(self) -> Array:
+        a00, a01, a11 = self.terms[[A00, A01, A11]]
+        return np.array([[a00, a01], [a01, a11]])
+
+
+def axes_at(mechanism: Mechanism, angles: Array, rates: Array, parallel: bool,
+            reference_angles: Array | None = None, reference_rates: Array = NONE) -> Axes:
+    found = Axes(*(np.full(shape, np.nan) for shape in ((3, 4), (2, 2), 3, TERMS)))
+    axes_of(angles, rates, angles if reference_angles is None else reference_angles,
+            reference_rates, parallel, np.array([mechanism.constants]), found.rows, found.errors,
+            found.bias, found.terms)
+    return found
+
+
+def on_branch(phi_a: float, theta: float) -> Array:
+    return np.array([phi_a, phi_a + theta, phi_a, phi_a + theta])
+
+
+@pytest.fixture
+def mechanism(linkage: str, request: pytest.FixtureRequest) -> Mechanism:
+    found: Mechanism = request.getfixturevalue(linkage)
+    return found
+
+
+# Paper eq. 6
+
+@each_seed
+@each_parallelogram
+def test_on_the_parallelogram_it_is_the_reduced_form(
+    seed: int, linkage: str, mechanism: Mechanism,
+) -> None:
+    rng = np.random.default_rng(seed)
+    theta = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, pi - 0.3)
+    angles, rates = on_branch(rng.uniform(-10.0, 10.0), theta), np.tile(rng.uniform(-2, 2, 2), 2)
+    form, axes = reduced_form(mechanism, angles, rates), axes_at(mechanism, angles, rates, True)
+    # The reduced form divides by |sin theta|^2 of 0.09, and loses as much.
+    scale = np.abs(form.mass_matrix).max()
+    np.testing.assert_allclose(axes.matrix, form.mass_matrix, atol=1e-14 * scale,
+                               err_msg=f'seed {seed}')
+    np.testing.assert_allclose(axes.bias[:2], form.bias, atol=1e-12 * scale * 4.0,
+                               err_msg=f'seed {seed}')
+    np.testing.assert_allclose(axes.rows[:2], form.wheel_map, atol=1e-13, err_msg=f'seed {seed}')
+
+
+@each_seed
+def test_elsewhere_it_is_the_reduced_form_with_no_third_axis(seed: int, uneven: Mechanism
+                                                             ) -> None:
+    rng = np.random.default_rng(seed)
+    angles = assemble(uneven, 0.3 * seed, 0.3 * seed + rng.uniform(0.9, 2.0),
+                      'open' if seed % 2 else 'crossed')
+    rates, wanted = rng.uniform(-1.0, 1.0, 4), rng.uniform(-1.0, 1.0, 4)
+    form = reduced_form(uneven, angles, rates)
+    axes = axes_at(uneven, angles, rates, False, angles + 0.1 * wanted, wanted)
+    np.testing.assert_array_equal(axes.matrix, form.mass_matrix)
+    np.testing.assert_array_equal(axes.bias, [*form.bias, 0.0])
+    np.testing.assert_array_equal(axes.rows, [*form.wheel_map, NONE])
+    np.testing.assert_allclose(axes.errors, [0.1 * wanted[:2], (wanted - rates)[:2]], atol=1e-14)
+    assert not axes.terms[BRANCH_A:CONDITION].any()
+    assert axes.terms[CONDITION] == pytest.approx(np.linalg.cond(form.mass_matrix), rel=1e-12)
+
+
+@pytest.mark.parametrize('theta', [0.0, pi, -pi, 2.0 * pi])
+@each_parallelogram
+def test_through_change_points_all_is_finite_and_continuous(
+    theta: float, linkage: str, mechanism: Mechanism,
+) -> None:
+    """What changes is cosines and sines of theta, so not by more than it; the row of eta not."""
+    rates, step = np.array([0.7, -1.3, 0.7, -1.3]), 1e-6
+    before, at, after = (axes_at(mechanism, on_branch(0.4, theta + change), rates, True)
+                         for change in (-step, 0.0, step))
+    assert all(np.isfinite(values).all() for values in (at.rows, at.bias, at.terms, at.errors))
+    scale = np.abs(at.terms[:BRANCH_ANGLE]).max()
+    for near in (before, after):
+        np.testing.assert_array_equal(near.rows, at.rows)
+        np.testing.assert_allclose(near.terms[:BRANCH_ANGLE], at.terms[:BRANCH_ANGLE],
+                                   atol=4.0 * scale * step)
+        np.testing.assert_allclose(near.bias, at.bias, atol=4.0 * scale * step * 1.3 ** 2)
+        assert near.terms[HOLD] == at.terms[HOLD] == 1.0
+
+
+@pytest.mark.parametrize('theta', [0.0, pi])
+@each_parallelogram
+def test_row_of_eta_is_the_motion_that_the_closure_leaves_free(
+    theta: float, linkage: str, mechanism: Mechanism,
+) -> None:
+    """`l_c eta_c = l_a eta_a` and so on: joint 3 stays closed, the pairs stay where they are."""
+    angles = on_branch(0.4, theta)
+    rows = axes_at(mechanism, angles, NONE, True).rows
+    free = rows[2]
+    assert free[2] - free[0] == 1.0
+    np.testing.assert_allclose(rows[:2] @ free, 0.0, atol=1e-16)
+    arms = np.array([-1.0, 1.0, 1.0, -1.0]) * mechanism.link_lengths
+    assert abs((arms * free) @ np.exp(1j * angles)) < 1e-16
+
+
+@each_seed
+@each_parallelogram
+def test_inertia_of_the_three_axes_is_that_of_the_links(
+    seed: int, linkage: str, mechanism: Mechanism,
+) -> None:
+    """The kinetic energy of any rates on the axes."""
+    rng = np.random.default_rng(seed)
+    angles = on_branch(rng.uniform(-3.0, 3.0), rng.uniform(-0.1, 0.1))
+    axes, on_axes = axes_at(mechanism, angles, NONE, True), rng.uniform(-1.0, 1.0, 3)
+    coupling, own = axes.terms[[BRANCH_A, BRANCH_B]], axes.terms[BRANCH_INERTIA]
+    matrix = np.block([[axes.matrix, coupling[:, None]], [coupling[None, :], np.array([[own]])]])
+    assert 0.5 * on_axes @ matrix @ on_axes == pytest.approx(
+        kinetic_energy(mechanism, angles, axes.rows.T @ on_axes, NONE), rel=1e-12), f'seed {seed}'
+    assert axes.terms[CONDITION] == pytest.approx(np.linalg.cond(axes.matrix), rel=1e-9)
+
+
+@each_seed
+@each_parallelogram
+def test_errors_are_those_of_the_pairs_and_eta_is_what_is_left(
+    seed: int, linkage: str, mechanism: Mechanism,
+) -> None:
+    rng = np.random.default_rng(seed)
+    angles, rates = on_branch(0.3, rng.choice([0.01, pi - 0.01])), rng.uniform(-1.0, 1.0, 4)
+    free = axes_at(mechanism, angles, NONE, True).rows[2]
+    (pair_a, pair_b, eta), (rate_a, rate_b, eta_rate) = rng.uniform(-0.1, 0.1, (2, 3))
+    axes = axes_at(mechanism, angles, rates, True,
+                   angles + [pair_a, pair_b, pair_a, pair_b] - eta * free,
+                   rates + [rate_a, rate_b, rate_a, rate_b] - eta_rate * free)
+    np.testing.assert_allclose(axes.errors, [[pair_a, pair_b], [rate_a, rate_b]], atol=1e-14,
+                               err_msg=f'seed {seed}')
+    np.testing.assert_allclose(axes.terms[[BRANCH_ANGLE, BRANCH_RATE]], [eta, eta_rate],
+                               atol=1e-14, err_msg=f'seed {seed}')
+
+
+def test_hold_is_full_at_change_points_and_fades_without_a_corner() -> None:
+    """From a cubic: its slope is no more than 1.5 / width, the change of that 6 / width^2."""
+    theta = np.linspace(-pi, 2.0 * pi, 30_001)
+    hold, sizes = np.array([hold_on_branch(angle) for angle in theta]), np.abs(np.sin(theta))
+    assert (hold[sizes <= FULL_HOLD] == 1.0).all()
+    assert (hold[sizes >= NO_HOLD] == 0.0).all()
+    step, width = theta[1] - theta[0], NO_HOLD - FULL_HOLD
+    assert np.abs(np.diff(hold)).max() <= 1.5 / width * step
+    assert np.abs(np.diff(hold, 2)).max() <= (6.0 / width ** 2 + 1.5 / width) * step ** 2
+    order = np.argsort(sizes)
+    assert (np.diff(hold[order]) <= 1e-12).all()
+
+
+# The law
+
+def demand_of(axes: Axes, errors: Array, acceleration: Array = NONE[:2], band: float = 0.0,
+              sticking: float = 0.0, disturbance: Array = NONE[:2], stiffness: float = 16.0,
+              damping: float = 7.2) -> Array:
+    found = np.full(3, np.nan)
+    demanded(acceleration, errors, stiffness, damping, band, disturbance, sticking, axes.bias,
+             axes.terms, found)
+    return found
+
+
+@pytest.fixture(params=SEEDS)
+def random_axes(request: pytest.FixtureRequest, uneven: Mechanism) -> Axes:
+    """Take the linkage in some pose, at rest: without b."""
+    rng = np.random.default_rng(request.param)
+    return axes_at(uneven, assemble(uneven, 0.1, 0.1 + rng.uniform(0.9, 2.0)), NONE, False)
+
+
+def acceleration_of(axes: Axes, demand: Array) -> Array:
+    found: Array = np.linalg.solve(axes.matrix, demand[:2] - axes.bias[:2])
+    return found
+
+
+def test_links_accelerate_as_the_law_says(random_axes: Axes) -> None:
+    errors, planned = np.array([[0.01, -0.03], [0.2, 0.1]]), np.array([0.5, -0.7])
+    demand = demand_of(random_axes, errors, planned, band=0.01)
+    np.testing.assert_allclose(
+        acceleration_of(random_axes, demand), planned + 7.2 * errors[1] + 16.0 * errors[0],
+        rtol=1e-11)
+
+
+@pytest.mark.parametrize('sticking', [0.0, 0.3, 1.0])
+def test_attitude_errors_act_whatever_sticks(sticking: float, random_axes: Axes) -> None:
+    """All links off by the same angle: nothing turns in the joints, so no band applies."""
+    errors = np.array([[1e-4, 1e-4], [0.0, 0.0]])
+    demand = demand_of(random_axes, errors, band=0.05, sticking=sticking)
+    np.testing.assert_allclose(acceleration_of(random_axes, demand), 16.0 * 1e-4, rtol=1e-10)
+
+
+def configuration_error(axes: Axes, theta: float) -> Array:
+    """Turn the joints only: without angular momentum about the whole."""
+    first, second = axes.matrix.sum(axis=0) / axes.matrix.sum()
+    return np.array([[-second * theta, first * theta], [0.0, 0.0]])
+
+
+@pytest.mark.parametrize('theta', [0.0, 3e-4, -5e-4, 8e-4, -0.01])
+def test_configuration_errors_within_the_band_do_nothing_at_rest(theta: float, random_axes: Axes
+                                                                 ) -> None:
+    """Beyond it they act from zero on: what a law without band does for the error less it."""
+    band = 5e-4
+    demand = demand_of(random_axes, configuration_error(random_axes, theta), band=band,
+                       sticking=1.0)
+    beyond = np.sign(theta) * max(abs(theta) - band, 0.0)
+    np.testing.assert_allclose(
+        demand, demand_of(random_axes, configuration_error(random_axes, beyond)),
+        atol=1e-14 * 16.0 * band * np.abs(random_axes.matrix).max())
+    moving = demand_of(random_axes, configuration_error(random_axes, theta), band=band)
+    np.testing.assert_array_equal(
+        moving, demand_of(random_axes, configuration_error(random_axes, theta)))
+
+
+def test_disturbance_is_taken_off_in_motion(random_axes: Axes) -> None:
+    """The wheels give what is missing: links accelerate as without it."""
+    pushed = np.array([3e-6, -5e-6])
+    np.testing.assert_allclose(
+        demand_of(random_axes, np.zeros((2, 2)), disturbance=pushed)[:2], -pushed, rtol=1e-12)
+
+
+def test_at_rest_only_what_turns_the_whole_is_taken_off(random_axes: Axes) -> None:
+    """Friction in the joints is torque between the links: it sums up to nothing."""
+    still = np.zeros((2, 2))
+    pushed = np.array([3e-6, -5e-6])
+    demand = demand_of(random_axes, still, disturbance=pushed, sticking=1.0)
+    assert demand[:2].sum() == pytest.approx(-pushed.sum(), rel=1e-12)
+    turned = acceleration_of(random_axes, demand)
+    assert turned[0] == pytest.approx(turned[1], rel=1e-10)
+    between = demand_of(random_axes, still, disturbance=np.array([4e-6, -4e-6]), sticking=1.0)
+    # The difference of two almost equal torques.
+    np.testing.assert_allclose(between, 0.0, atol=4e-6 * 1e-15)

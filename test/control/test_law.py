@@ -1,0 +1,305 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Torques of the law, in the equations of motion of all four links."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import pi
+
+from fourbar_ros.control import ControllerSettings
+from fourbar_ros.control.allocation import AllocationError, ALLOCATIONS
+from fourbar_ros.control.axes import BRANCH_A, BRANCH_B, HOLD, NO_HOLD
+from fourbar_ros.control.guide import Guide
+from fourbar_ros.control.law import (
+    Decision,
+    HORIZON,
+    motor_bounds,
+    SHARED_OUT,
+    TrackingLaw,
+)
+from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism, reduced_form
+from fourbar_ros.mechanism.motors import available_torque, motors_of
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+Accelerations = Callable[[Mechanism, Array, Array, Array], Array]
+
+SEEDS = range(10)
+NONE, QUIET, ALL = np.zeros(4), np.zeros(2), np.ones(4, dtype=bool)
+STIFFNESS, DAMPING = 16.0, 7.2
+
+each_seed = pytest.mark.parametrize('seed', SEEDS)
+
+
+def without_limits(mechanism: Mechanism) -> Mechanism:
+    """Give motors that bear everything; finite, as `bounded` needs them."""
+    return replace(
+        mechanism, motor_torque_limits=np.full(4, 1e3), motor_speed_limits=np.full(4, 1e9),
+        motor_voltages=np.full(4, np.inf))
+
+
+def guide_at(mechanism: Mechanism, angles: Array, rates: Array, accelerations: Array) -> Guide:
+    """Make a reference that is on a move."""
+    guide = Guide(mechanism)
+    guide.begin(angles)
+    guide.angles[:] = angles
+    guide.rates[:], guide.accelerations[:] = rates, accelerations
+    return guide
+
+
+def consistent(mechanism: Mechanism, angles: Array, rates: Array) -> Array:
+    """Complete the rates of links a and b by paper eq. 6."""
+    gamma = reduced_form(mechanism, angles, rates).gamma
+    return np.concatenate([rates, gamma @ rates])
+
+
+def law_of(mechanism: Mechanism, usable: NDArray[np.bool_] = ALL, **settings: float | str
+           ) -> TrackingLaw:
+    law = TrackingLaw(mechanism)
+    law.tune(ControllerSettings(**settings), usable)  # type: ignore[arg-type]
+    return law
+
+
+def decide(law: TrackingLaw, guide: Guide, angles: Array, rates: Array,
+           disturbance: Array = QUIET, speeds: Array = NONE, friction: Array = NONE,
+           sticking: float = 0.0) -> Decision:
+    return law.decide(guide, angles, rates, disturbance, speeds, friction, sticking)
+
+
+# In the plant
+
+@pytest.mark.parametrize('target', ['free', 'balanced', 'zero', 'bias'])
+@pytest.mark.parametrize('allocation', ALLOCATIONS)
+@each_seed
+def test_links_accelerate_exactly_as_asked(
+    seed: int, allocation: str, target: str, uneven: Mechanism, accelerations: Accelerations,
+) -> None:
+    """Any pose and motion; whatever the wheels do among themselves moves nothing."""
+    rng = np.random.default_rng(seed)
+    mechanism = without_limits(uneven)
+    phi_a = rng.uniform(-3.0, 3.0)
+    angles = assemble(mechanism, phi_a, phi_a + rng.uniform(0.9, 2.0),
+                      'open' if seed % 2 else 'crossed')
+    rates = consistent(mechanism, angles, rng.uniform(-1.0, 1.0, 2))
+    behind, slower = rng.uniform(-0.05, 0.05, 4), rng.uniform(-0.5, 0.5, 4)
+    planned = rng.uniform(-2.0, 2.0, 4)
+    guide = guide_at(mechanism, angles + behind, rates + slower, planned)
+    found = decide(law_of(mechanism, allocation=allocation, wheel_target=target), guide, angles,
+                   rates, speeds=rng.uniform(-100.0, 100.0, 4))
+    assert found.scale == 1.0
+    asked = planned + DAMPING * slower + STIFFNESS * behind
+    given = accelerations(mechanism, angles, rates, found.torques)
+    np.testing.assert_allclose(given[:2], asked[:2], rtol=1e-9, atol=1e-9, err_msg=f'seed {seed}')
+    # The plan alone, likewise.
+    np.testing.assert_allclose(
+        accelerations(mechanism, angles, rates, found.planned)[:2], planned[:2], rtol=1e-9,
+        atol=1e-9, err_msg=f'seed {seed}')
+
+
+@pytest.mark.parametrize('linkage', ['paper', 'prototype', 'parallelogram'])
+@each_seed
+def test_pairs_accelerate_exactly_as_asked(
+    seed: int, linkage: str, request: pytest.FixtureRequest, accelerations: Accelerations,
+) -> None:
+    """On the branch, whether it is held there or by the closure."""
+    rng = np.random.default_rng(seed)
+    mechanism = without_limits(request.getfixturevalue(linkage))
+    theta = rng.choice([rng.uniform(0.4, 2.7), rng.uniform(0.02, 0.3), pi - 0.01])
+    angles = rng.uniform(-3.0, 3.0) + np.array([0.0, theta, 0.0, theta])
+    rates, behind, planned = (np.tile(rng.uniform(-size, size, 2), 2) for size in (1.0, 0.05, 2.0))
+    guide = guide_at(mechanism, angles + behind, NONE, planned)
+    found = decide(law_of(mechanism, wheel_target='zero'), guide, angles, rates,
+                   speeds=rng.uniform(-100.0, 100.0, 4))
+    asked = planned - DAMPING * rates + STIFFNESS * behind
+    # Next to a change point the joint forces are large, and so is what rounding makes of them.
+    np.testing.assert_allclose(
+        accelerations(mechanism, angles, rates, found.torques), asked, rtol=1e-7, atol=1e-7,
+        err_msg=f'seed {seed}')
+
+
+@pytest.mark.parametrize('wheels', [(0, 1, 2, 3), (1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])
+@pytest.mark.parametrize('theta', [0.0, pi])
+@pytest.mark.parametrize('linkage', ['paper', 'prototype', 'parallelogram'])
+def test_eta_accelerates_exactly_as_asked_at_a_change_point(
+    linkage: str, theta: float, wheels: tuple[int, ...], request: pytest.FixtureRequest,
+    accelerations: Accelerations,
+) -> None:
+    """With four wheels and with three, and the pairs as if nothing were the matter with eta."""
+    mechanism = without_limits(request.getfixturevalue(linkage))
+    angles, rates = 0.3 + np.array([0.0, theta, 0.0, theta]), np.tile([0.2, -0.5], 2)
+    law = law_of(mechanism, np.isin(range(4), wheels), branch_bandwidth=8.0)
+    free = decide(law, guide_at(mechanism, angles, rates, NONE), angles, rates).rows[2].copy()
+    eta, eta_rate, planned = 0.01, -0.05, np.tile([0.7, -0.4], 2)
+    guide = guide_at(mechanism, angles, rates, planned)
+    guide.angles -= eta * free
+    guide.rates -= eta_rate * free
+    found = decide(law, guide, angles, rates)
+    assert found.hold == 1.0
+    given = accelerations(mechanism, angles, rates, found.torques)
+    asked = -64.0 * eta - 16.0 * eta_rate
+    np.testing.assert_allclose(given - planned, asked * free, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize('wheels', [(0, 1), (2, 3), (0, 3)])
+@pytest.mark.parametrize('theta', [0.0, pi])
+def test_two_wheels_leave_eta_alone(
+    theta: float, wheels: tuple[int, ...], paper: Mechanism, accelerations: Accelerations,
+) -> None:
+    """They drive the axes as asked, and whatever is off with the branch does not disturb that."""
+    mechanism = without_limits(paper)
+    angles, planned = 0.3 + np.array([0.0, theta, 0.0, theta]), np.tile([0.7, -0.4], 2)
+    law = law_of(mechanism, np.isin(range(4), wheels))
+    guide = guide_at(mechanism, angles, NONE, planned)
+    fine = decide(law, guide, angles, NONE).torques.copy()
+    guide.angles += 0.01 * law.decision.rows[2]
+    found = decide(law, guide, angles, NONE)
+    np.testing.assert_allclose(found.torques, fine, atol=1e-16)
+    assert not found.torques[~np.isin(range(4), wheels)].any()
+    given = accelerations(mechanism, angles, NONE, found.torques)
+    np.testing.assert_allclose(0.5 * (given[:2] + given[2:]), planned[:2], rtol=1e-10)
+
+
+@pytest.mark.parametrize('usable', [4, 3])
+@pytest.mark.parametrize('linkage', ['paper', 'parallelogram'])
+def test_torques_change_without_a_corner_where_the_hold_fades(
+    linkage: str, usable: int, request: pytest.FixtureRequest,
+) -> None:
+    """Second differences go with the square of the step; those of a corner with the step."""
+    mechanism = without_limits(request.getfixturevalue(linkage))
+    law = law_of(mechanism, np.arange(4) < usable, wheel_target='balanced')
+
+    def largest(count: int) -> float:
+        torques = []
+        for theta in np.linspace(0.02, np.arcsin(NO_HOLD) + 0.1, count):
+            angles = np.array([0.0, theta, 0.0, theta])
+            guide = guide_at(mechanism, angles + [0.01, -0.02, 0.005, 0.01], NONE, NONE)
+            guide.parallel = True
+            torques.append(decide(law, guide, angles, NONE,
+                                  speeds=np.array([50.0, -20.0, 10.0, 80.0])).torques.copy())
+        return float(np.abs(np.diff(torques, 2, axis=0)).max())
+    assert largest(801) < 0.3 * largest(401)
+
+
+@each_seed
+def test_compensated_disturbance_leaves_nothing_behind(
+    seed: int, uneven: Mechanism, accelerations: Accelerations,
+) -> None:
+    """Of torques on links a and b the wheels take as large a share as they are told to."""
+    rng = np.random.default_rng(seed)
+    mechanism, share = without_limits(uneven), float(rng.uniform(0.0, 1.0))
+    angles = assemble(mechanism, 0.1, 0.1 + rng.uniform(0.9, 2.0))
+    pushed = np.append(rng.uniform(-1e-4, 1e-4, 2), [0.0, 0.0])
+    law = law_of(mechanism, disturbance_compensation=share)
+    found = decide(law, guide_at(mechanism, angles, NONE, NONE), angles, NONE, pushed[:2])
+    with_wheels = accelerations(mechanism, angles, NONE, found.torques - pushed)
+    alone = accelerations(mechanism, angles, NONE, -pushed)
+    np.testing.assert_allclose(with_wheels, (1.0 - share) * alone, rtol=1e-8, atol=1e-8,
+                               err_msg=f'seed {seed}')
+
+
+# Bounds
+
+@pytest.mark.parametrize('name', ['paper', 'prototype'])
+@each_seed
+def test_motors_can_give_what_lies_within_their_bounds(seed: int, name: str) -> None:
+    """By the law of the plant, friction included; zero always does."""
+    rng = np.random.default_rng(seed)
+    mechanism = load_mechanism(name)
+    boxed = np.array([motors_of(mechanism)])
+    limits, inertias = mechanism.motor_speed_limits, mechanism.flywheel_inertias
+    speeds = rng.uniform(-1.2, 1.2, 4) * limits
+    friction = rng.uniform(-0.1, 0.1, 4) * mechanism.motor_torque_limits
+    lower, upper = np.empty(4), np.empty(4)
+    motor_bounds(speeds, friction, boxed, lower, upper)
+    assert (lower <= 0.0).all()
+    assert (upper >= 0.0).all()
+    for wheel in range(4):
+        for torque in (lower[wheel], upper[wheel]):
+            if torque == 0.0:
+                continue
+            asked = torque + friction[wheel]
+            assert available_torque(wheel, asked, speeds[wheel], boxed[0]) == asked, f'seed {seed}'
+            # It is not driven past its limit before the horizon, and beyond it not outwards.
+            reached = speeds[wheel] + HORIZON * torque / inertias[wheel]
+            assert abs(reached) <= max(limits[wheel], abs(speeds[wheel])) * (1.0 + 1e-12)
+    # Far from both limits nothing but the share is kept back.
+    motor_bounds(np.zeros(4), NONE, boxed, lower, upper)
+    largest = np.minimum(mechanism.motor_torque_limits, inertias / HORIZON * limits)
+    np.testing.assert_allclose(upper, np.minimum(
+        SHARED_OUT * mechanism.motor_torque_limits, largest), rtol=1e-12)
+    np.testing.assert_allclose(lower, -upper, rtol=1e-12)
+
+
+@pytest.mark.parametrize('target', ['free', 'bias'])
+@pytest.mark.parametrize('allocation', ALLOCATIONS)
+@each_seed
+def test_bounds_are_kept_with_everything_on_top(
+    seed: int, allocation: str, target: str, prototype: Mechanism,
+) -> None:
+    """Errors beyond what the motors can do, next to a change point or not."""
+    rng = np.random.default_rng(seed)
+    theta = rng.choice([0.02, 0.2, 0.3, 1.2])
+    angles = np.array([0.0, theta, 0.0, theta])
+    guide = guide_at(prototype, angles, NONE, NONE)
+    guide.angles += rng.uniform(-0.5, 0.5, 4)
+    law = law_of(prototype, rng.permutation([True, True, True, bool(seed % 2)]),
+                 allocation=allocation, wheel_target=target, wheel_bandwidth=5.0)
+    friction = rng.uniform(-1e-3, 1e-3, 4)
+    found = decide(law, guide, angles, rng.uniform(-0.5, 0.5, 4),
+                   speeds=rng.uniform(-300.0, 300.0, 4), friction=friction)
+    assert 0.0 <= found.scale <= 1.0
+    assert (found.torques >= found.lower - 1e-15).all(), f'seed {seed}'
+    assert (found.torques <= found.upper + 1e-15).all(), f'seed {seed}'
+    assert not found.torques[~law.usable].any()
+    assert (np.abs(found.torques + friction) <= prototype.motor_torque_limits).all()
+
+
+def test_plan_asks_for_nothing_that_feedback_does(prototype: Mechanism) -> None:
+    """A reference that stands still plans no torque, whatever the errors are."""
+    angles = np.array([0.0, 1.0, 0.0, 1.0])
+    guide = guide_at(prototype, angles + 0.1, NONE, NONE)
+    found = decide(law_of(prototype), guide, angles, NONE)
+    assert found.torques.any()
+    np.testing.assert_allclose(found.planned, 0.0, atol=1e-18)
+
+
+# What can be driven
+
+@pytest.mark.parametrize(('wheels', 'lost'), [
+    ((0, 1, 2, 3), []), ((0, 1), []), ((2, 3), []), ((0, 3), []), ((1, 2, 3), []),
+    ((0, 2), ['b']), ((1, 3), ['a']), ((0,), ['b']), ((3,), ['a'])])
+def test_axes_that_no_wheel_turns_are_lost(
+    wheels: tuple[int, ...], lost: list[str], paper: Mechanism,
+) -> None:
+    law = law_of(paper, np.isin(range(4), wheels))
+    angles = assemble(paper, 0.0, 1.0)
+    decide(law, guide_at(paper, angles, NONE, NONE), angles, NONE)
+    assert law.lost_axes() == lost
+
+
+def test_unknown_allocation_is_refused(paper: Mechanism) -> None:
+    with pytest.raises(AllocationError, match="'least' is unknown"):
+        law_of(paper, allocation='least')
+
+
+def test_off_the_parallelogram_nothing_is_held(uneven: Mechanism) -> None:
+    angles = assemble(uneven, 0.0, 1.0)
+    found = decide(law_of(uneven), guide_at(uneven, angles, NONE, NONE), angles, NONE)
+    assert found.hold == 0.0
+    assert not found.terms[[BRANCH_A, BRANCH_B, HOLD]].any()
