@@ -20,17 +20,12 @@ from math import pi
 from typing import Any
 
 from fourbar_ros.control import (
-    Control,
     Controller,
     ControllerSettings,
-    GainError,
-    Point,
     SetpointError,
 )
 from fourbar_ros.control.accounts import COPPER, EQ9, FLYWHEEL_ENERGY, WORK
-from fourbar_ros.control.allocation import AllocationError
 from fourbar_ros.control.controller import NO_HOLD
-from fourbar_ros.control.guide import STOPPING_TIME
 from fourbar_ros.control.law import SHARED_OUT
 from fourbar_ros.mechanism import assemble, kinetic_energy, Mechanism
 from fourbar_ros.mechanism.angles import wrap_angles
@@ -246,7 +241,7 @@ def near_change_point(name: str) -> tuple[Mechanism, Array]:
         return mechanism, assemble(mechanism, 0.2, 0.2 + pi - 0.03, 'crossed')
     mechanism = Mechanism([0.12, 0.10, 0.09, 0.10], *same)  # type: ignore[arg-type]
     # Links a and b span almost as much as c and d together.
-    gap, (a, b, c, d) = 0.19 - 1e-5, mechanism.link_lengths
+    gap, (a, b) = 0.19 - 1e-5, mechanism.link_lengths[:2]
     theta = np.arccos((a * a + b * b - gap * gap) / (2.0 * a * b))
     return mechanism, assemble(mechanism, 0.2, 0.2 + theta)
 
@@ -300,7 +295,8 @@ def test_energy_and_the_two_accounts_of_effort(drive: Drive, paper: Mechanism) -
         kinetic_energy(paper, angles, NONE, absolute), rel=1e-12)
     assert control.energies[COPPER] == 0.0
     assert control.energies[EQ9] == pytest.approx(3.4e-7 * float(absolute @ absolute), rel=1e-12)
-    assert control.energies[WORK] == pytest.approx(1e-5 * 20.0 + 1e-5 * 30.0 + 2e-5 * 40.0, rel=1e-12)
+    assert control.energies[WORK] == pytest.approx(
+        1e-5 * 20.0 + 1e-5 * 30.0 + 2e-5 * 40.0, rel=1e-12)
     controller.device_armed(False)
     controller.tick(2 * 10 ** 9 + PERIOD_NS, angles, rates, QUIET, speeds, efforts)
     controller.device_armed(True)

@@ -1,0 +1,99 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What wheels hold is physics; what motors spent are sums over time."""
+
+from __future__ import annotations
+
+from fourbar_ros.control.accounts import (
+    Accounts,
+    COPPER,
+    ENERGIES,
+    EQ9,
+    FLYWHEEL_ENERGY,
+    LONGEST_PERIOD,
+    WORK,
+)
+from fourbar_ros.mechanism import assemble, kinetic_energy, Mechanism
+from fourbar_ros.plant import InitialState, Plant, Table
+from fourbar_ros.plant.sensors import LinkSensorSettings
+from fourbar_ros.plant.table import WheelEncoders
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+
+NONE = np.zeros(4)
+
+
+def test_names_are_in_the_order_of_the_numbers() -> None:
+    assert [ENERGIES[n] for n in (FLYWHEEL_ENERGY, EQ9, WORK, COPPER)] == [
+        'flywheel_energy_j', 'eq9_j_s', 'work_j', 'copper_loss_j']
+
+
+def test_energy_is_that_of_the_wheels_with_their_links(prototype: Mechanism) -> None:
+    accounts, angles = Accounts(prototype), assemble(prototype, 0.0, 1.0)
+    rates, speeds = np.array([0.5, -0.2, 0.5, -0.2]), np.array([20.0, -30.0, 40.0, 0.0])
+    for _ in range(3):
+        accounts.book(4e-3, rates, speeds, NONE)
+    assert accounts.energies[FLYWHEEL_ENERGY] == pytest.approx(
+        kinetic_energy(prototype, angles, NONE, speeds + rates), rel=1e-12)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_heat_is_that_of_the_ledger(seed: int, prototype: Mechanism) -> None:
+    """The plant keeps accounts of its own; efforts here are means of a period, as measured."""
+    plant = Plant(prototype, Table(LinkSensorSettings(), WheelEncoders(0)), InitialState(), 5e-4,
+                  np.random.default_rng(0))
+    accounts, rng = Accounts(prototype), np.random.default_rng(seed)
+    for _ in range(50):
+        torques = rng.uniform(-0.004, 0.004, 4)
+        # Motors that have come to what they are asked for: the square of a mean is the mean of
+        # squares then.
+        plant.advance(200, torques)
+        before = plant.ledger().copper
+        plant.advance(8, torques)
+        truth = plant.truth()
+        booked = accounts.energies[COPPER]
+        accounts.book(4e-3, truth.link_rates, truth.wheel_speeds, truth.efforts)
+        assert accounts.energies[COPPER] - booked == pytest.approx(
+            plant.ledger().copper - before, rel=1e-6), f'seed {seed}'
+
+
+def test_motors_that_are_not_described_lose_nothing(paper: Mechanism) -> None:
+    accounts = Accounts(paper)
+    accounts.book(4e-3, NONE, NONE + 5.0, NONE + 1e-4)
+    assert accounts.energies[COPPER] == 0.0
+    assert accounts.energies[WORK] == pytest.approx(4.0 * 5.0 * 1e-4 * 4e-3)
+
+
+@pytest.mark.parametrize('period', [0.0, 1.01 * LONGEST_PERIOD, 100.0])
+def test_silence_does_not_count(period: float, prototype: Mechanism) -> None:
+    accounts = Accounts(prototype)
+    accounts.book(period, NONE, NONE + 5.0, NONE + 1e-2)
+    assert not accounts.energies[[EQ9, WORK, COPPER]].any()
+    assert accounts.energies[FLYWHEEL_ENERGY] > 0.0
+
+
+def test_sums_grow_whatever_the_signs_and_begin_anew(prototype: Mechanism) -> None:
+    accounts, rng = Accounts(prototype), np.random.default_rng(3)
+    last = accounts.energies.copy()
+    for _ in range(100):
+        accounts.book(4e-3, rng.normal(size=4), 50.0 * rng.normal(size=4),
+                      1e-2 * rng.normal(size=4))
+        assert (accounts.energies[[EQ9, WORK, COPPER]] > last[[EQ9, WORK, COPPER]]).all()
+        last = accounts.energies.copy()
+    accounts.begin()
+    assert not accounts.energies.any()

@@ -1,0 +1,196 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Commands make wheels gain the momentum that is asked for, whatever their bearings take."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fourbar_ros.control import ControllerSettings, WheelCommand
+from fourbar_ros.control.drive import by_name, REACH, UNSURE, WheelDrive
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.motors import SPEED_BANDWIDTH
+from fourbar_ros.plant import InitialState, Plant, Table
+from fourbar_ros.plant.sensors import LinkSensorSettings
+from fourbar_ros.plant.table import WheelBearings, WheelEncoders
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+
+PERIOD, STEP = 4e-3, 5e-4
+STEPS = 8
+ALL = np.ones(4, dtype=bool)
+NONE = np.zeros(4)
+RUBBING = WheelBearings(viscous=2e-6, coulomb=1e-3, static_ratio=1.3)
+
+
+def plant_with(mechanism: Mechanism, bearings: WheelBearings) -> Plant:
+    table = Table(LinkSensorSettings(), WheelEncoders(0), wheel_bearings=bearings)
+    return Plant(mechanism, table, InitialState(), STEP, np.random.default_rng(0))
+
+
+def momenta(mechanism: Mechanism, plant: Plant) -> Array:
+    """Return what the wheels hold, absolute (4,) [N m s]."""
+    truth = plant.truth()
+    return mechanism.flywheel_inertias * (truth.wheel_speeds + truth.link_rates)
+
+
+def drive_for(plant: Plant, drive: WheelDrive, torques: Array, seconds: float, by_speed: bool,
+              settings: ControllerSettings) -> list[WheelCommand]:
+    """Command torques that shall act, as the controller does, telling it how links accelerate."""
+    commands, rates = [], plant.truth().link_rates
+    for _ in range(round(seconds / PERIOD)):
+        truth = plant.truth()
+        # Free links accelerate as the wheels push them; of the last period that is exact enough.
+        acceleration, rates = (truth.link_rates - rates) / PERIOD, truth.link_rates
+        drive.look(truth.wheel_speeds, settings)
+        command = drive.command(torques, acceleration, truth.wheel_speeds, ALL, PERIOD, by_speed)
+        plant.advance(STEPS, command.values, command.by_speed, command.powered)
+        commands.append(command)
+    return commands
+
+
+TORQUES = np.array([2e-3, -1.5e-3, 1e-3, -3e-3])
+
+
+@pytest.mark.parametrize('bearings', [WheelBearings(), RUBBING], ids=['smooth', 'rubbing'])
+def test_commanded_speeds_make_wheels_gain_the_momentum_asked_for(
+    bearings: WheelBearings, prototype: Mechanism,
+) -> None:
+    """From standstill: what the bearings take, the motors' own loop gives besides."""
+    plant, drive = plant_with(prototype, bearings), WheelDrive(prototype)
+    drive.begin(np.zeros(4))
+    drive_for(plant, drive, TORQUES, 2.0, True, ControllerSettings())
+    gained = momenta(prototype, plant)
+    # It follows a ramp with its speed late by no more than 4 a / bandwidth^2 times the friction
+    # of the way in; in 2 s that is less than 2 periods of the torque.
+    np.testing.assert_allclose(gained, TORQUES * 2.0, atol=2.0 * PERIOD * np.abs(TORQUES).max())
+
+
+def test_commanded_torques_have_the_friction_added(prototype: Mechanism) -> None:
+    """Known bearings, once turning: the momentum comes as asked, and does not without."""
+    bearings = replace(RUBBING, static_ratio=1.0)
+    known = ControllerSettings(bearing_coulomb=bearings.coulomb, bearing_viscous=bearings.viscous)
+    for settings, gained_share in ((known, 1.0), (ControllerSettings(), 0.5)):
+        plant, drive = plant_with(prototype, bearings), WheelDrive(prototype)
+        plant.advance(1000, 2.0 * TORQUES + np.copysign(2e-3, TORQUES))
+        assert np.abs(plant.truth().wheel_speeds).min() > 10.0 * UNSURE
+        # Until the motors give what they are told and no longer what they were.
+        drive_for(plant, drive, TORQUES, 0.1, False, settings)
+        before = momenta(prototype, plant)
+        commands = drive_for(plant, drive, TORQUES, 1.0, False, settings)
+        gained = (momenta(prototype, plant) - before) / TORQUES
+        assert not any(command.by_speed for command in commands)
+        if gained_share == 1.0:
+            # Viscous friction grows by 2e-6 * 25 rad/s a second, of which a period is missed.
+            np.testing.assert_allclose(gained, 1.0, atol=1e-3)
+        else:
+            assert (gained < 0.7).all()
+
+
+def test_friction_is_known_by_sign_from_a_little_speed_on(prototype: Mechanism) -> None:
+    drive = WheelDrive(prototype)
+    settings = ControllerSettings(bearing_coulomb=1e-3, bearing_viscous=2e-6)
+    speeds = np.array([0.0, 0.25 * UNSURE, -UNSURE, 100.0])
+    np.testing.assert_allclose(
+        drive.look(speeds, settings),
+        [0.0, 2.5e-4 + 2e-6 * 0.25 * UNSURE, -1e-3 - 2e-6 * UNSURE, 1e-3 + 2e-4], rtol=1e-12)
+    # Dissipative, odd, and without a jump.
+    sweep = np.linspace(-2.0, 2.0, 4001)
+    friction = np.array([drive.look(np.full(4, speed), settings)[0] for speed in sweep])
+    assert (friction * sweep >= 0.0).all()
+    np.testing.assert_allclose(friction, -friction[::-1], atol=1e-18)
+    assert np.abs(np.diff(friction)).max() <= (1e-3 / UNSURE + 2e-6) * 1.001e-3
+
+
+def test_motors_are_not_asked_for_more_than_their_limit(prototype: Mechanism) -> None:
+    drive = WheelDrive(prototype)
+    drive.look(np.full(4, 100.0), ControllerSettings(bearing_coulomb=1e-3))
+    command = drive.command(np.array([0.05, -0.05, 0.02, 0.0]), NONE, NONE, ALL, PERIOD, False)
+    np.testing.assert_allclose(command.values, [0.05, -0.049, 0.021, 0.001])
+
+
+@pytest.mark.parametrize('speed', [0.0, 120.0, -40.0])
+def test_speeds_start_where_the_wheels_are(speed: float, prototype: Mechanism) -> None:
+    """No torque asked for, none given, however fast they turn: bumpless."""
+    plant, drive = plant_with(prototype, WheelBearings()), WheelDrive(prototype)
+    plant.advance(1000, np.full(4, speed), True)
+    # More than 30 time constants of the motors.
+    plant.advance(200, np.zeros(4))
+    before = momenta(prototype, plant)
+    truth = plant.truth()
+    drive.begin(truth.wheel_speeds)
+    command = drive.command(NONE, NONE, truth.wheel_speeds, ALL, PERIOD, True)
+    np.testing.assert_array_equal(command.values, truth.wheel_speeds)
+    plant.advance(STEPS, command.values, True)
+    np.testing.assert_allclose(momenta(prototype, plant), before, rtol=1e-9, atol=1e-12)
+
+
+def test_change_from_torques_to_speeds_goes_on_from_what_is_measured(prototype: Mechanism
+                                                                     ) -> None:
+    drive = WheelDrive(prototype)
+    drive.begin(np.full(4, 500.0))
+    speeds = np.array([10.0, -20.0, 30.0, 0.0])
+    drive.command(NONE, NONE, speeds, ALL, PERIOD, False)
+    np.testing.assert_array_equal(
+        drive.command(NONE, NONE, speeds, ALL, PERIOD, True).values, speeds)
+
+
+def test_speeds_run_ahead_no_further_than_the_motor_can_follow(prototype: Mechanism) -> None:
+    """A wheel that does not follow is asked for most of its torque, and winds nothing up."""
+    drive, speeds = WheelDrive(prototype), np.full(4, 20.0)
+    drive.begin(speeds)
+    for _ in range(1000):
+        command = drive.command(TORQUES, NONE, speeds, ALL, PERIOD, True)
+    asked = SPEED_BANDWIDTH * prototype.flywheel_inertias * (command.values - speeds)
+    np.testing.assert_allclose(
+        asked, REACH * prototype.motor_torque_limits * np.sign(TORQUES), rtol=1e-12)
+    back = drive.command(-TORQUES, NONE, speeds, ALL, PERIOD, True)
+    assert (np.sign(back.values - command.values) == -np.sign(TORQUES)).all()
+
+
+def test_links_that_accelerate_take_their_wheels_along(prototype: Mechanism) -> None:
+    """A wheel without torque keeps its absolute speed: relative to its link it falls behind."""
+    drive, acceleration = WheelDrive(prototype), np.array([1.0, -2.0, 0.5, 0.0])
+    drive.begin(NONE)
+    for _ in range(5):
+        command = drive.command(NONE, acceleration, NONE, ALL, PERIOD, True)
+    np.testing.assert_allclose(command.values, -5.0 * PERIOD * acceleration, rtol=1e-12)
+
+
+# Without power
+
+def test_wheel_without_power_is_not_named_and_wound_up(prototype: Mechanism) -> None:
+    drive, powered = WheelDrive(prototype), np.array([True, False, True, True])
+    drive.begin(NONE)
+    for speed in (10.0, 8.0, 6.0):
+        command = drive.command(TORQUES, NONE, np.full(4, speed), powered, PERIOD, True)
+    names, velocities, efforts = by_name(command)
+    assert names == ('flywheel_a', 'flywheel_c', 'flywheel_d')
+    assert velocities == command.values[[0, 2, 3]].tolist()
+    assert efforts == []
+    assert command.values[1] == 6.0
+
+
+@pytest.mark.parametrize('by_speed', [False, True])
+def test_message_has_either_velocities_or_efforts(by_speed: bool) -> None:
+    values = np.array([1.0, 2.0, 3.0, 4.0])
+    names, velocities, efforts = by_name(WheelCommand(values, by_speed, ALL))
+    assert names == ('flywheel_a', 'flywheel_b', 'flywheel_c', 'flywheel_d')
+    assert (velocities, efforts) == (([1.0, 2.0, 3.0, 4.0], []) if by_speed
+                                     else ([], [1.0, 2.0, 3.0, 4.0]))
+    assert by_name(WheelCommand(values, by_speed, ~ALL)) == ((), [], [])

@@ -1,0 +1,239 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The reference goes on without a jump, and comes to rest before a change point."""
+
+from __future__ import annotations
+
+from math import pi, sin
+
+from fourbar_ros.control.guide import Guide, STOPPING_TIME
+from fourbar_ros.control.reference import SoftStep
+from fourbar_ros.control.setpoint import CHANGE_POINT_MARGIN, follow
+from fourbar_ros.mechanism import assemble, closure_error, Mechanism, reduced_form
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+
+PERIOD_NS = 4_000_000
+PERIOD = 4e-3
+SEEDS = range(10)
+
+each_seed = pytest.mark.parametrize('seed', SEEDS)
+
+
+def moving_guide(mechanism: Mechanism, angles: Array, travel: Array, duration: float,
+                 seconds: float) -> tuple[Guide, int]:
+    """Return a guide after some time of a move, and the stamp."""
+    guide = Guide(mechanism)
+    guide.begin(angles)
+    step = SoftStep(guide.motion.copy(), guide.motion[0] + travel, duration)
+    guide.go(step, follow(mechanism, step, guide.angles, crossing=guide.parallel)[-1], 10 ** 9)
+    now = 10 ** 9
+    for _ in range(round(seconds / PERIOD)):
+        now += PERIOD_NS
+        guide.follow(now)
+    return guide, now
+
+
+def run(guide: Guide, now: int, seconds: float) -> tuple[Array, Array, Array]:
+    """Go on, and return angles, rates and accelerations (n, 4), the present first."""
+    found = [(guide.angles.copy(), guide.rates.copy(), guide.accelerations.copy())]
+    for _ in range(round(seconds / PERIOD)):
+        now += PERIOD_NS
+        guide.follow(now)
+        found.append((guide.angles.copy(), guide.rates.copy(), guide.accelerations.copy()))
+    angles, rates, accelerations = (np.array(values) for values in zip(*found))
+    return angles, rates, accelerations
+
+
+def check_continuous(angles: Array, rates: Array, jerk: float) -> None:
+    """Rates are the derivative of angles, and change by what a jerk allows."""
+    # The trapezoid of the rates is off by no more than jerk T^3 / 12.
+    np.testing.assert_allclose(
+        np.diff(angles, axis=0), 0.5 * PERIOD * (rates[1:] + rates[:-1]),
+        atol=jerk * PERIOD ** 3 / 12.0 + 1e-13)
+
+
+# Where it begins
+
+def test_it_stands_where_the_links_are(uneven: Mechanism) -> None:
+    guide, angles = Guide(uneven), assemble(uneven, 0.3, 1.5)
+    guide.begin(angles)
+    np.testing.assert_array_equal(guide.angles, angles)
+    np.testing.assert_array_equal(guide.destination, angles)
+    assert not guide.parallel
+    assert not guide.moving
+    assert guide.goal is None
+    assert not guide.motion[1:].any()
+
+
+@pytest.mark.parametrize('turns_c', [0, 1, -3])
+@pytest.mark.parametrize('turns_d', [0, -1, 2])
+@pytest.mark.parametrize('theta', [1.0, 0.0, pi, -0.5])
+def test_pairs_are_parallel_on_whatever_turns_they_are(
+    theta: float, turns_c: int, turns_d: int, paper: Mechanism,
+) -> None:
+    """It is nearest to what it was given, and not a jump by turns."""
+    guide = Guide(paper)
+    off = np.array([1e-3, -2e-3, -1e-3, 4e-3])
+    turns = 2.0 * pi * np.array([0, 0, turns_c, turns_d])
+    measured = 0.4 + np.array([0.0, theta, 0.0, theta]) + off + turns
+    guide.begin(measured)
+    assert guide.parallel
+    np.testing.assert_allclose(
+        guide.angles[2:] - guide.angles[:2], 2.0 * pi * np.array([turns_c, turns_d]), atol=1e-12)
+    # The mean of each pair: half of the difference is left.
+    np.testing.assert_allclose(np.abs(guide.angles - measured), [1e-3, 3e-3, 1e-3, 3e-3],
+                               atol=1e-12)
+    step = SoftStep(guide.motion.copy(), guide.motion[0] + 0.3, 1.0)
+    guide.go(step, guide.angles + 0.3, 10 ** 9)
+    before = guide.angles.copy()
+    assert not guide.follow(10 ** 9)
+    np.testing.assert_allclose(guide.angles, before, atol=1e-12)
+    assert guide.follow(2 * 10 ** 9)
+    np.testing.assert_allclose(guide.angles, before + 0.3, atol=1e-12)
+
+
+@each_seed
+def test_links_c_and_d_follow_by_closure(seed: int, uneven: Mechanism) -> None:
+    rng = np.random.default_rng(seed)
+    angles = assemble(uneven, 0.3, 1.5)
+    guide, now = moving_guide(uneven, angles, rng.uniform(-0.4, 0.4, 2), 2.0, 0.8)
+    assert closure_error(uneven, guide.angles) < 1e-15
+    gamma = reduced_form(uneven, guide.angles, guide.rates).gamma
+    np.testing.assert_allclose(guide.rates[2:], gamma @ guide.rates[:2], rtol=1e-12)
+    assert guide.time_left(now) == pytest.approx(1.2)
+    reached, rates, _ = run(guide, now, 1.2)
+    # Third derivatives of a quintic by 0.4 rad in 2 s, a and b, and what the gearing makes of it.
+    check_continuous(reached, rates, 60.0 * 0.4 / 2.0 ** 3 * 10.0)
+    assert not guide.moving
+    assert not guide.rates.any()
+    np.testing.assert_allclose(guide.angles, guide.goal, atol=1e-9)
+
+
+# Giving up
+
+@pytest.mark.parametrize('seconds', [0.2, 1.0, 1.7])
+@pytest.mark.parametrize('linkage', ['uneven', 'paper'])
+def test_halt_comes_to_rest_soon_without_a_jump(
+    linkage: str, seconds: float, request: pytest.FixtureRequest,
+) -> None:
+    mechanism = request.getfixturevalue(linkage)
+    guide, now = moving_guide(
+        mechanism, assemble(mechanism, 0.3, 1.5), np.array([0.4, 0.3]), 2.0, seconds)
+    motion = guide.motion.copy()
+    guide.halt(now)
+    assert guide.goal is not None
+    guide.follow(now)
+    # Angle, rate and acceleration are taken over.
+    np.testing.assert_allclose(guide.motion, motion, atol=1e-12)
+    angles, rates, _ = run(guide, now, STOPPING_TIME + 2.0 * PERIOD)
+    check_continuous(angles, rates, 60.0 * 10.0)
+    assert not rates[-1].any()
+    assert not guide.moving
+    # No farther than it would have gone at this rate, or as the acceleration took it.
+    reach = np.abs(motion[1]) * STOPPING_TIME + 0.5 * np.abs(motion[2]) * STOPPING_TIME ** 2
+    assert (np.abs(angles[:, :2] - motion[0]) <= reach + 1e-12).all()
+
+
+def test_halt_at_rest_changes_nothing(paper: Mechanism) -> None:
+    guide = Guide(paper)
+    guide.begin(assemble(paper, 0.3, 1.5))
+    before = guide.angles.copy()
+    guide.halt(10 ** 9)
+    assert not guide.moving
+    np.testing.assert_array_equal(guide.angles, before)
+
+
+@each_seed
+def test_moving_links_are_taken_over(seed: int, uneven: Mechanism) -> None:
+    """The reference begins with the rates that they have, and stops within its time."""
+    rng = np.random.default_rng(seed)
+    guide, angles = Guide(uneven), assemble(uneven, 0.3, 1.5)
+    rates = np.zeros(4)
+    rates[:2] = rng.uniform(-0.3, 0.3, 2)
+    rates[2:] = reduced_form(uneven, angles, rates).gamma @ rates[:2]
+    guide.move_from(angles, rates, 10 ** 9)
+    assert guide.goal is None
+    assert guide.moving
+    guide.follow(10 ** 9)
+    np.testing.assert_allclose(guide.rates, rates, rtol=1e-12)
+    np.testing.assert_allclose(guide.angles, angles, atol=1e-12)
+    reached, speeds, _ = run(guide, 10 ** 9, STOPPING_TIME)
+    check_continuous(reached, speeds, 60.0 * 10.0)
+    assert not guide.rates.any()
+    # A quintic from a rate to rest over half of rate times time turns back nowhere.
+    assert (reached[1:, :2] - reached[:-1, :2]) @ np.diag(np.sign(rates[:2])) == pytest.approx(
+        np.abs(np.diff(reached[:, :2], axis=0)), abs=1e-15)
+
+
+def near_change_point(mechanism: Mechanism, sine: float) -> Array:
+    """Fold c and d until |sin(phi_d - phi_c)| is so small."""
+    lengths = mechanism.link_lengths
+    a, b, c, d = lengths
+    gap = np.sqrt(c * c + d * d - 2.0 * c * d * np.cos(pi - np.arcsin(sine)))
+    theta = np.arccos((a * a + b * b - gap * gap) / (2.0 * a * b))
+    return assemble(mechanism, 0.2, 0.2 + float(theta))
+
+
+@pytest.fixture(scope='module')
+def folding() -> Mechanism:
+    """Make a linkage whose links c and d can lie in line, with no equal opposite links."""
+    return Mechanism(  # type: ignore[arg-type]
+        [0.12, 0.10, 0.09, 0.10], [0.02] * 4, [2.2e-5] * 4, [[0.05, 0.0]] * 4, [3.4e-7] * 4)
+
+
+@pytest.mark.parametrize(('sine', 'rate', 'at_once'), [
+    (0.5, 0.3, False), (0.3, 0.3, False), (0.13, 0.05, False), (0.11, 0.02, False),
+    (0.11, 1.0, True), (0.1001, 0.3, True)])
+def test_it_comes_to_rest_before_a_change_point(
+    sine: float, rate: float, at_once: bool, folding: Mechanism,
+) -> None:
+    """In less time the nearer that is; at once if there is no time."""
+    guide, angles = Guide(folding), near_change_point(folding, sine)
+    assert abs(sin(angles[3] - angles[2])) == pytest.approx(sine, rel=1e-9)
+    rates = np.array([0.0, rate, 0.0, 0.0])
+    rates[2:] = reduced_form(folding, angles, rates).gamma @ rates[:2]
+    guide.move_from(angles, rates, 10 ** 9)
+    assert guide.moving == (not at_once)
+    reached, speeds, _ = run(guide, 10 ** 9, STOPPING_TIME)
+    sines = np.abs(np.sin(reached[:, 3] - reached[:, 2]))
+    assert sines[-1] < sine or at_once
+    assert sines.min() >= CHANGE_POINT_MARGIN - 1e-6
+    assert not speeds[-1].any()
+
+
+def test_on_the_parallelogram_a_change_point_is_no_obstacle(paper: Mechanism) -> None:
+    guide = Guide(paper)
+    rates = np.tile([0.0, 0.3], 2)
+    guide.move_from(np.array([0.2, 0.15, 0.2, 0.15]), rates, 10 ** 9)
+    reached, _, _ = run(guide, 10 ** 9, STOPPING_TIME)
+    theta = reached[:, 1] - reached[:, 0]
+    assert theta[0] < 0.0 < theta[-1]
+    np.testing.assert_allclose(reached[:, 2:], reached[:, :2], atol=1e-15)
+    assert theta[-1] == pytest.approx(-0.05 + 0.3 * 0.5 * STOPPING_TIME)
+
+
+def test_following_the_links_it_has_no_motion_of_its_own(paper: Mechanism) -> None:
+    guide, _ = moving_guide(paper, assemble(paper, 0.3, 1.5), np.array([0.4, 0.3]), 2.0, 0.8)
+    here = assemble(paper, 0.5, 1.4)
+    guide.stand_at(here)
+    np.testing.assert_array_equal(guide.angles, here)
+    assert not guide.moving
+    assert not guide.rates.any()
+    assert not guide.motion[1:].any()
+    assert not guide.follow(10 ** 10)

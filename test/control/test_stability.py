@@ -1,0 +1,162 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Gains are refused where the sampled loop, simulated, does not come to rest."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+import re
+
+from fourbar_ros.control import ControllerSettings, GainError
+from fourbar_ros.control.stability import (
+    check_gains,
+    decay_rate,
+    largest_bandwidth,
+    LEAST_DECAY,
+)
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.mechanism.motors import lagged_torque, motors_of, speed_loop
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+
+SEEDS = range(60)
+STEP = 5e-5
+
+
+def with_lag(mechanism: Mechanism, lag: float) -> Mechanism:
+    return replace(mechanism, motor_time_constants=np.full(4, lag),
+                   motor_torque_limits=np.full(4, np.inf))
+
+
+@kernel
+def simulate(bandwidth: float, damping: float, period: float, by_speed: bool, errors: Array,
+             boxed: NDArray[np.record]) -> None:
+    """
+    Hold a double integrator as the controller does, with a motor as the plant has it.
+
+    Torques are in units of acceleration times the wheel's inertia. A command answers the sample
+    of a period ago, and is held.
+
+    :param errors: receives the error and its rate over the bandwidth, as one, at each sample.
+    """
+    motors = boxed[0]
+    inertia = motors.inertia[0]
+    error, rate = 1.0, 0.0
+    torque = speed = integral = answer = total = 0.0
+    steps = max(round(period / STEP), 20)
+    h = period / steps
+    for n in range(errors.size):
+        errors[n] = (error * error + (rate / bandwidth) ** 2) ** 0.5
+        wanted = answer
+        answer = -bandwidth ** 2 * error - 2.0 * damping * bandwidth * rate
+        total += wanted * period
+        for _ in range(steps):
+            asked = wanted * inertia
+            if by_speed:
+                asked, integral = speed_loop(0, total, speed, integral, h, motors)
+            mean, torque = lagged_torque(0, torque, asked, h, motors)
+            acceleration = mean / inertia
+            speed += acceleration * h
+            error += rate * h + 0.5 * acceleration * h * h
+            rate += acceleration * h
+
+
+@pytest.mark.parametrize('by_speed', [False, True])
+@pytest.mark.parametrize('seed', SEEDS)
+def test_errors_of_the_simulated_loop_fall_off_at_the_rate_told(
+    seed: int, by_speed: bool, prototype: Mechanism,
+) -> None:
+    """Random gains, rates and lags; whether errors fall or grow, and how fast."""
+    rng = np.random.default_rng(seed)
+    bandwidth, damping = float(rng.uniform(0.5, 40.0)), float(rng.uniform(0.3, 2.0))
+    period, lag = float(rng.uniform(1e-3, 0.05)), float(rng.choice([0.0, 3e-3, 0.02]))
+    told = decay_rate(bandwidth, damping, period, lag, by_speed)
+    seconds = min(max(20.0 / max(abs(told), 1e-3), 60.0 * period), 2000.0 * period)
+    errors = np.empty(round(seconds / period))
+    simulate(bandwidth, damping, period, by_speed, errors,
+             np.array([motors_of(with_lag(prototype, lag))]))
+    # Envelopes over the first and the last fifth: peaks, since errors swing.
+    fifth = errors.size // 5
+    first, last = (np.log(errors[part].max()) for part in (
+        slice(fifth, 2 * fifth), slice(-fifth, None)))
+    apart = period * (errors.size - 2 * fifth)
+    found = (first - last) / apart
+    # Peaks are met to within a swing, and the beginning has other modes in it: a factor of ten.
+    assert abs(found - told) < 0.05 * abs(told) + np.log(10.0) / apart, f'seed {seed}'
+    settings = ControllerSettings(bandwidth=bandwidth, damping=damping, branch_bandwidth=0.0,
+                                  command='velocity' if by_speed else 'effort')
+    with suppress(GainError):
+        check_gains(settings, with_lag(prototype, lag), period)
+        assert errors[-1] < 0.1 * errors[0], f'seed {seed}'
+
+
+@pytest.mark.parametrize('by_speed', [False, True])
+@pytest.mark.parametrize(('period', 'lag'), [(4e-3, 3e-3), (0.02, 0.0), (0.05, 3e-3), (0.2, 0.01)])
+@pytest.mark.parametrize('damping', [0.5, 0.9, 2.0])
+def test_message_tells_the_largest_bandwidth_that_is_accepted(
+    damping: float, period: float, lag: float, by_speed: bool, prototype: Mechanism,
+) -> None:
+    """A little less is accepted, a little more is not."""
+    mechanism = with_lag(prototype, lag)
+    command = 'velocity' if by_speed else 'effort'
+    settings = ControllerSettings(
+        bandwidth=1000.0, damping=damping, command=command, branch_bandwidth=0.0)
+    with pytest.raises(GainError) as caught:
+        check_gains(settings, mechanism, period)
+    found = re.fullmatch(
+        r'bandwidth 1000 rad/s with damping (\S+) is not stable at (\S+) Hz, at most (\S+) rad/s '
+        'is', str(caught.value))
+    assert found, str(caught.value)
+    assert float(found[1]) == damping
+    assert float(found[2]) == pytest.approx(1.0 / period, rel=1e-3)
+    largest = largest_bandwidth(damping, period, lag, by_speed)
+    # Three digits are told.
+    assert float(found[3]) == pytest.approx(largest, rel=5e-3)
+    check_gains(replace(settings, bandwidth=0.99 * largest), mechanism, period)
+    with pytest.raises(GainError):
+        check_gains(replace(settings, bandwidth=1.01 * largest), mechanism, period)
+
+
+@pytest.mark.parametrize('by_speed', [False, True])
+def test_limit_is_where_errors_fall_at_a_fifth_of_what_is_meant(by_speed: bool) -> None:
+    largest = largest_bandwidth(0.9, 0.01, 3e-3, by_speed)
+    assert decay_rate(largest, 0.9, 0.01, 3e-3, by_speed) == pytest.approx(
+        LEAST_DECAY * 0.9 * largest, rel=0.02)
+
+
+def test_branch_is_checked_as_well_and_named(prototype: Mechanism) -> None:
+    with pytest.raises(GainError, match='branch_bandwidth 300 rad/s with damping 1 is not stable'):
+        check_gains(ControllerSettings(branch_bandwidth=300.0), prototype, 4e-3)
+    check_gains(ControllerSettings(branch_bandwidth=0.0), prototype, 4e-3)
+
+
+def test_slow_gains_are_as_fast_as_they_are_meant_to_be() -> None:
+    """Without lag, sampled fast: the real part of the poles of the double integrator."""
+    for damping in (0.3, 0.9, 1.0):
+        assert decay_rate(1.0, damping, 1e-4, 0.0, False) == pytest.approx(damping, rel=0.02)
+
+
+@pytest.mark.parametrize('command', ['effort', 'velocity'])
+def test_defaults_are_stable_at_the_usual_rates(
+    command: str, paper: Mechanism, prototype: Mechanism,
+) -> None:
+    for mechanism in (paper, prototype):
+        for rate in (100.0, 250.0, 1000.0):
+            check_gains(ControllerSettings(command=command), mechanism, 1.0 / rate)
