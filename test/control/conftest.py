@@ -112,14 +112,18 @@ class Steered:
         self.controller = controller
         self.disturbance: Array = np.zeros(2)
         self.stamp_ns = 1_000_000_000
+        self._wheel_angles = plant.truth().wheel_angles
 
     def tick(self) -> Control:
         """Go on by one tick; its command acts until the next."""
         self.stamp_ns += PERIOD_NS
         truth = self.plant.truth()
+        # As encoders tell them: the mean of the period.
+        speeds = (truth.wheel_angles - self._wheel_angles) / (PERIOD_NS * 1e-9)
+        self._wheel_angles = truth.wheel_angles
         control = self.controller.tick(
-            self.stamp_ns, truth.link_angles, truth.link_rates, self.disturbance,
-            truth.wheel_speeds, truth.efforts)
+            self.stamp_ns, truth.link_angles, truth.link_rates, self.disturbance, speeds,
+            truth.efforts)
         command = control.command
         self.plant.advance(round(PERIOD_NS * 1e-9 / PLANT_STEP), command.values,
                            command.by_speed, command.powered)

@@ -20,12 +20,17 @@ from math import pi
 from typing import Any
 
 from fourbar_ros.control import (
+    Control,
     Controller,
     ControllerSettings,
+    GainError,
+    Point,
     SetpointError,
 )
 from fourbar_ros.control.accounts import COPPER, EQ9, FLYWHEEL_ENERGY, WORK
+from fourbar_ros.control.allocation import AllocationError
 from fourbar_ros.control.controller import NO_HOLD
+from fourbar_ros.control.guide import STOPPING_TIME
 from fourbar_ros.control.law import SHARED_OUT
 from fourbar_ros.mechanism import assemble, kinetic_energy, Mechanism
 from fourbar_ros.mechanism.angles import wrap_angles
@@ -313,3 +318,431 @@ def test_copper_loss_is_resistance_times_current_squared(prototype: Mechanism) -
         control = controller.tick(10 ** 9 + n * PERIOD_NS, angles, NONE, QUIET, NONE,
                                   np.array([3e-3, 0.0, -6e-3, 0.0]))
     assert control.energies[COPPER] == pytest.approx(0.1 ** 2 + 0.2 ** 2, rel=1e-12)
+
+
+# Modes
+
+@pytest.fixture
+def moving(steer: Drive, prototype: Mechanism) -> Any:
+    """Give the bench-scale linkage in the middle of a move."""
+    steered = steer(prototype, setpoint_duration=4.0)
+    steered.controller.setpoint(['link_a', 'link_b'], [0.8, pi / 3 + 0.5])
+    steered.ticks(500)
+    assert steered.controller.mode == 'track'
+    return steered
+
+
+def settle(steered: Any, seconds: float = 4.0) -> None:
+    """Let it come to rest: more than ten time constants of the law."""
+    steered.ticks(round(seconds / PERIOD))
+
+
+def rates_of(steered: Any) -> Array:
+    rates: Array = steered.plant.truth().link_rates
+    return rates
+
+
+def test_idle_leaves_the_wheels_alone(moving: Any) -> None:
+    moving.controller.enable(False)
+    assert moving.controller.mode == 'track'
+    controls = moving.ticks(50)
+    assert moving.controller.mode == 'idle'
+    for control in controls:
+        assert not control.torques.any()
+        assert not control.command.values.any()
+        assert not control.command.by_speed
+        assert control.command.powered.all()
+        assert not control.angle_errors.any()
+    assert moving.controller.goal is None
+    # It drifts on: nothing drives and nothing brakes it.
+    assert np.abs(rates_of(moving)).min() > 0.1
+
+
+@pytest.mark.parametrize('act', ['setpoint', 'trajectory', 'hold', 'damp'])
+@pytest.mark.parametrize(('state', 'reason'), [
+    ('disarmed', 'the device is not armed'), ('idle', 'the controller is not enabled')])
+def test_nothing_is_done_while_it_may_not_drive(
+    act: str, state: str, reason: str, steer: Drive, prototype: Mechanism,
+) -> None:
+    steered = steer(prototype, armed=state != 'disarmed')
+    controller = steered.controller
+    controller.enable(state != 'idle')
+    steered.tick()
+    assert controller.mode == state
+    doing: dict[str, Callable[[], None]] = {
+        'setpoint': lambda: controller.setpoint(['link_a'], [0.1]),
+        'trajectory': lambda: controller.trajectory(['link_a'], [Point([0.1], 5.0)]),
+        'hold': controller.hold, 'damp': controller.damp}
+    with pytest.raises(SetpointError, match=f'^{reason}$'):
+        doing[act]()
+    counted = act in ('setpoint', 'trajectory')
+    assert (controller.accepted, controller.refused) == (0, int(counted))
+    assert controller.last_refusal == (reason if counted else '')
+    steered.tick()
+    assert (controller.mode, controller.goal) == (state, None)
+
+
+def test_enabled_again_it_stops_links_that_move_and_holds_them(moving: Any) -> None:
+    controller = moving.controller
+    controller.enable(False)
+    moving.ticks(50)
+    before = rates_of(moving)
+    controller.enable(True)
+    first = moving.tick()
+    assert controller.mode == 'hold'
+    # It begins with what they have: no error, and no torque but what it takes to go on so.
+    # In a period a stop within a second, of 0.5 rad/s, changes them by 60 * 0.5 T^2 / 2 at most.
+    np.testing.assert_allclose(first.reference_rates, before, atol=15.0 * PERIOD ** 2)
+    np.testing.assert_allclose(first.angle_errors, 0.0, atol=1e-3)
+    settle(moving)
+    assert np.abs(rates_of(moving)).max() < 1e-4
+    assert controller.mode == 'hold'
+
+
+def test_hold_gives_the_move_up_and_stays(moving: Any) -> None:
+    controller = moving.controller
+    controller.hold()
+    assert (controller.mode, controller.goal) == ('hold', None)
+    moving.ticks(round(STOPPING_TIME / PERIOD) + 1)
+    held = moving.tick().reference_angles
+    settle(moving)
+    np.testing.assert_array_equal(moving.tick().reference_angles, held)
+    np.testing.assert_allclose(moving.plant.truth().link_angles, held, atol=1e-4)
+    # Not where it was going: given up.
+    assert np.abs(held[:2] - [0.8, pi / 3 + 0.5]).max() > 0.05
+
+
+def test_damp_stops_all_rates_wherever_that_ends(moving: Any) -> None:
+    controller = moving.controller
+    controller.damp()
+    assert (controller.mode, controller.goal) == ('damp', None)
+    last = rates_of(moving)
+    for _ in range(round(3.0 / PERIOD)):
+        control = moving.tick()
+        assert not control.angle_errors.any()
+        assert not control.reference_rates.any()
+        rates = rates_of(moving)
+        # A rhombus: A is constant, so every rate falls off by itself, 2 * 0.9 * 4 per second.
+        assert (np.abs(rates) <= np.abs(last) + 1e-6).all()
+        last = rates
+    assert controller.mode == 'damp'
+    assert np.abs(last).max() < 1e-4
+
+
+STEPS: dict[str, Callable[[Any], None]] = {
+    'enable': lambda steered: steered.controller.enable(True),
+    'disable': lambda steered: steered.controller.enable(False),
+    'hold': lambda steered: steered.controller.hold(),
+    'damp': lambda steered: steered.controller.damp(),
+    'track': lambda steered: steered.controller.setpoint(
+        ['link_a', 'link_b'], [0.5, pi / 3 + 0.3])}
+
+
+@pytest.mark.parametrize('command', ['effort', 'velocity'])
+@pytest.mark.parametrize('second', [*STEPS])
+@pytest.mark.parametrize('first', [*STEPS])
+def test_any_mode_follows_any_other_without_a_blow(
+    first: str, second: str, command: str, steer: Drive, prototype: Mechanism,
+) -> None:
+    """
+    The torque never jumps by more than what it takes to brake the links that move, and it ends.
+
+    Links turn at 0.5 rad/s at most, with A below 0.05 kg m^2 and 7.2 /s of damping, shared by two
+    wheels; besides, a reference at rest may be left behind by 0.05 rad, and the plan have its
+    own acceleration of 1 rad/s^2.
+    """
+    steered = steer(prototype, setpoint_duration=4.0, command=command)
+    STEPS['track'](steered)
+    steered.ticks(400)
+    most = 0.5 * 0.05 * (7.2 * 0.5 + 16.0 * 0.05 + 1.0)
+    torques = [steered.tick().torques]
+    for step in (first, second):
+        allowed = steered.controller.mode != 'idle' or step in ('enable', 'disable')
+        if allowed:
+            STEPS[step](steered)
+        else:
+            with pytest.raises(SetpointError, match='not enabled'):
+                STEPS[step](steered)
+        torques += [control.torques for control in steered.ticks(60)]
+    assert np.abs(np.diff(torques, axis=0)).max() < most
+    steered.controller.enable(True)
+    steered.tick()
+    steered.controller.hold()
+    settle(steered, 5.0)
+    assert steered.controller.mode == 'hold'
+    assert np.abs(rates_of(steered)).max() < 1e-3
+    assert not steered.controller.wheels.findings()
+    assert steered.controller.problem == ''
+
+
+@pytest.mark.parametrize('act', ['setpoint', 'trajectory'])
+def test_setpoint_while_damping_starts_from_the_links_as_they_move(act: str, moving: Any) -> None:
+    controller = moving.controller
+    controller.damp()
+    before = moving.ticks(5)[-1]
+    rates, angles = rates_of(moving), moving.plant.truth().link_angles
+    assert np.abs(rates).max() > 0.1
+    # The tick that the setpoint follows saw them a period ago.
+    seen = controller.rates.copy()
+    goal = [0.8, pi / 3 + 0.5]
+    if act == 'setpoint':
+        controller.setpoint(['link_a', 'link_b'], goal)
+    else:
+        controller.trajectory(['link_a', 'link_b'], [Point(goal, 4.0)])
+    assert controller.mode == 'track'
+    control = moving.tick()
+    assert not before.reference_rates.any()
+    # One period on, the quintic has changed its rate by no more than its largest acceleration.
+    np.testing.assert_allclose(control.reference_rates, seen, atol=PERIOD * 1.0)
+    np.testing.assert_allclose(control.reference_angles, angles, atol=PERIOD * 0.5 * PERIOD + 2e-4)
+    settle(moving, 6.0)
+    np.testing.assert_allclose(moving.plant.truth().link_angles[:2], goal, atol=1e-4)
+
+
+def test_repeated_tick_answers_the_same(moving: Any) -> None:
+    """A lock-step sends it again when its answer was lost, perhaps with other numbers."""
+    control = moving.tick()
+    saturated, drift = moving.controller.saturated, moving.controller.momentum.drift.copy()
+    truth = moving.plant.truth()
+    for _ in range(3):
+        assert moving.controller.tick(
+            moving.stamp_ns, truth.link_angles, truth.link_rates, QUIET, truth.wheel_speeds,
+            truth.efforts) is control
+    assert moving.controller.saturated == saturated
+    np.testing.assert_array_equal(moving.controller.momentum.drift, drift)
+    assert moving.tick() is not control
+
+
+def test_answers_are_not_written_anew(moving: Any) -> None:
+    """What a tick returned stays as it was."""
+    control = moving.tick()
+    kept = {name: np.array(getattr(control, name)) for name in (
+        'torques', 'reference_angles', 'reference_rates', 'angle_errors', 'rate_errors',
+        'energies')}
+    values = control.command.values.copy()
+    moving.ticks(20)
+    for name, before in kept.items():
+        np.testing.assert_array_equal(getattr(control, name), before, err_msg=name)
+    np.testing.assert_array_equal(control.command.values, values)
+
+
+# Commands
+
+def test_by_speed_wheels_are_told_speeds_and_links_move_the_same(steer: Drive,
+                                                                prototype: Mechanism) -> None:
+    """Motors that follow torques and motors that follow speeds end at the same place."""
+    ends = []
+    for command in ('effort', 'velocity'):
+        steered = steer(prototype, setpoint_duration=2.0, command=command)
+        steered.controller.setpoint(['link_a', 'link_b'], [0.3, pi / 3 + 0.2])
+        controls = steered.ticks(750)
+        assert all(control.command.by_speed == (command == 'velocity') for control in controls)
+        ends.append(steered.plant.truth().link_angles)
+        np.testing.assert_allclose(ends[-1][:2], [0.3, pi / 3 + 0.2], atol=1e-4)
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-4)
+
+
+def test_command_can_be_changed_on_the_way(moving: Any) -> None:
+    """From torques to speeds and back, bumpless: half of what the move itself changes them by."""
+    controller, settings = moving.controller, moving.controller.settings
+    errors = []
+    for command in ('velocity', 'effort'):
+        controller.tune(replace(settings, command=command))
+        errors += [control.angle_errors for control in moving.ticks(100)]
+        assert controller.mode == 'track'
+    # Without a change it is below 2e-3 rad: a motor's lag and a tick late.
+    assert np.abs(errors).max() < 4e-3
+    assert not controller.wheels.findings()
+
+
+# Gains and rates
+
+UNSTABLE = {'bandwidth': 20.0, 'damping': 2.0}
+
+
+def test_gains_that_are_unstable_at_this_rate_are_refused(drive: Drive) -> None:
+    """At 50 Hz, seen from the stamps; nothing changes."""
+    driven = drive(armed=False)
+    controller = driven.controller
+    before = controller.settings
+    for tick in range(3):
+        controller.tick(10 ** 10 + tick * 20_000_000, driven.angles, NONE, QUIET, NONE, NONE)
+    with pytest.raises(GainError, match=r'^bandwidth 20 rad/s with damping 2 is not stable at 50 '
+                                        r'Hz, at most \d+(\.\d+)? rad/s is$'):
+        controller.tune(replace(before, **UNSTABLE))
+    assert controller.settings is before
+    controller.tune(replace(before, bandwidth=3.0))
+    assert controller.settings.bandwidth == 3.0
+
+
+def test_unknown_allocation_is_refused_and_changes_nothing(drive: Drive) -> None:
+    controller = drive().controller
+    before = controller.settings
+    with pytest.raises(AllocationError):
+        controller.tune(replace(before, allocation='least'))
+    assert controller.settings is before
+
+
+def test_gains_too_fast_for_the_rate_that_comes_are_not_driven(paper: Mechanism) -> None:
+    """Before the first two ticks the rate is unknown; then it idles, says why, and can be told."""
+    settings = ControllerSettings(**UNSTABLE)  # type: ignore[arg-type]
+    controller = Controller(paper, settings)
+    controller.device_armed(True)
+    angles, stamp = assemble(paper, 0.0, 1.0), 10 ** 9
+
+    def tick() -> Control:
+        nonlocal stamp
+        stamp += 20_000_000
+        return controller.tick(stamp, angles + 0.01, NONE, QUIET, NONE, NONE)
+    controls = [tick() for _ in range(4)]
+    assert controller.mode == 'idle'
+    assert controller.problem.startswith('bandwidth 20 rad/s with damping 2 is not stable at 50')
+    assert not controls[-1].torques.any()
+    with pytest.raises(SetpointError, match='^bandwidth 20 rad/s with damping 2 is not stable'):
+        controller.setpoint(['link_a'], [0.1])
+    controller.tune(replace(settings, bandwidth=3.0))
+    tick()
+    assert (controller.mode, controller.problem) == ('hold', '')
+    controller.setpoint(['link_a'], [0.1])
+    assert controller.mode == 'track'
+
+
+def test_rate_that_falls_makes_it_idle(paper: Mechanism) -> None:
+    """At 250 Hz they are stable, at 50 not."""
+    settings = ControllerSettings(**UNSTABLE)  # type: ignore[arg-type]
+    controller = Controller(paper, settings)
+    controller.device_armed(True)
+    angles, stamp = assemble(paper, 0.0, 1.0), 10 ** 9
+    for _ in range(5):
+        stamp += PERIOD_NS
+        controller.tick(stamp, angles, NONE, QUIET, NONE, NONE)
+    assert controller.mode == 'hold'
+    # A tick or two that got lost make no new rate.
+    for lost in (2, 3):
+        stamp += lost * PERIOD_NS
+        controller.tick(stamp, angles, NONE, QUIET, NONE, NONE)
+        assert controller.mode == 'hold'
+    for _ in range(2):
+        stamp += 22_000_000
+        controller.tick(stamp, angles, NONE, QUIET, NONE, NONE)
+    assert controller.mode == 'idle'
+    assert 'not stable at 45.45' in controller.problem
+    stamp += PERIOD_NS
+    controller.tick(stamp, angles, NONE, QUIET, NONE, NONE)
+    assert (controller.mode, controller.problem) == ('hold', '')
+
+
+# What is asked for
+
+def test_more_than_the_wheels_bear_is_refused_with_the_shortest_duration(drive: Drive) -> None:
+    driven = drive(setpoint_duration=1.0)
+    with pytest.raises(SetpointError, match=r'^needs .* on flywheel_\w, limit .*; shortest '
+                                            r'duration is (\S+) s$') as caught:
+        quarter_turn(driven)
+    controller = driven.controller
+    assert (controller.accepted, controller.refused) == (0, 1)
+    assert controller.last_refusal == str(caught.value)
+    shortest = float(str(caught.value).split()[-2])
+    controller.tune(replace(controller.settings, setpoint_duration=shortest))
+    quarter_turn(driven)
+    assert controller.accepted == 1
+
+
+@pytest.mark.parametrize('linkage', ['paper', 'prototype'])
+def test_shortest_timing_takes_as_long_as_the_wheels_need(
+    linkage: str, steer: Drive, request: pytest.FixtureRequest,
+) -> None:
+    """Whatever the duration is set to: as the refusal of a shorter one says."""
+    mechanism = request.getfixturevalue(linkage)
+    goal = [pi / 2, pi / 3 + pi / 2]
+    refused = steer(mechanism, setpoint_duration=1.0)
+    with pytest.raises(SetpointError) as caught:
+        refused.controller.setpoint(['link_a', 'link_b'], goal)
+    shortest = float(str(caught.value).split()[-2])
+    steered = steer(mechanism, setpoint_duration=1.0, setpoint_timing='shortest')
+    steered.controller.setpoint(['link_a', 'link_b'], goal)
+    errors = []
+    while steered.controller.mode == 'track':
+        errors.append(steered.tick().angle_errors)
+    # Told in hundredths, rounded up; ends with the first tick after it.
+    assert shortest - 0.01 - PERIOD <= len(errors) * PERIOD <= shortest + PERIOD
+    # The links come along: a motor's lag of 3 ms and half a tick, at 7 rad/s^2 at most, lets the
+    # law be behind by lag times acceleration over its stiffness.
+    assert np.abs(errors).max() < 3e-3
+    settle(steered)
+    np.testing.assert_allclose(steered.plant.truth().link_angles[:2], goal, atol=1e-5)
+
+
+def test_trajectory_goes_through_its_points_in_time(drive: Drive) -> None:
+    driven = drive()
+    points = [Point([0.1, pi / 3 + 0.05], 4.0), Point([0.1, pi / 3 - 0.05], 8.0),
+              Point([0.3, pi / 3], 14.0)]
+    driven.controller.trajectory(['link_a', 'link_b'], points)
+    assert (driven.controller.mode, driven.controller.accepted) == ('track', 1)
+    np.testing.assert_allclose(driven.controller.goal[:2], [0.3, pi / 3])
+    for point, seconds in zip(points, (4.0, 4.0, 6.0)):
+        for _ in range(round(seconds / PERIOD)):
+            control = driven.tick()
+        np.testing.assert_allclose(control.reference_angles[:2], point.positions, atol=1e-9)
+    assert driven.controller.mode == 'hold'
+    assert driven.controller.saturated == 0
+
+
+@pytest.mark.parametrize(('names', 'points', 'reason'), [
+    ([], [Point([], 5.0)], 'named'),
+    (['link_a'], [], 'point'),
+    (['link_x'], [Point([0.1], 5.0)], 'link_x'),
+    (['link_a'], [Point([float('nan')], 5.0)], 'nan'),
+    (['link_a'], [Point([0.1], 5.0, effort=[1.0])], 'effort'),
+    (['link_a'], [Point([0.1], 5.0), Point([0.2], 4.0)], 'time'),
+    (['link_a', 'link_b'], [Point([pi / 2, pi], 0.5)], '^needs '),
+    (['link_b'], [Point([0.0], 10.0)], 'change point')])
+def test_trajectory_is_refused_whole(
+    names: list[str], points: list[Point], reason: str, drive: Drive,
+) -> None:
+    driven = drive()
+    with pytest.raises(SetpointError, match=reason) as caught:
+        driven.controller.trajectory(names, points)
+    controller = driven.controller
+    assert (controller.accepted, controller.refused, controller.mode) == (0, 1, 'hold')
+    assert controller.last_refusal == str(caught.value)
+    assert '\n' not in controller.last_refusal
+    assert controller.goal is None
+
+
+@pytest.mark.parametrize('offset_s', [-1.1, 1.1])
+def test_trajectory_with_a_foreign_stamp_is_refused(offset_s: float, drive: Drive) -> None:
+    driven = drive()
+    with pytest.raises(SetpointError, match='before the last tick'):
+        driven.controller.trajectory(
+            ['link_a'], [Point([0.1], 5.0)], driven.stamp_ns + round(offset_s * 1e9))
+
+
+def test_change_points_are_avoided_or_kept(drive: Drive) -> None:
+    """To the other side of theta = 0, or to rest on it: only where it may cross."""
+    for goal in (-0.3, 0.0):
+        avoiding = drive(phi_b=0.3)
+        with pytest.raises(SetpointError, match='change point'):
+            avoiding.controller.setpoint(['link_b'], [goal])
+        keeping = drive(phi_b=0.3, change_points='keep')
+        keeping.controller.setpoint(['link_b'], [goal])
+        for _ in range(2501):
+            control = keeping.tick()
+        np.testing.assert_allclose(control.reference_angles, [0.0, goal, 0.0, goal], atol=1e-9)
+        assert keeping.controller.mode == 'hold'
+
+
+@pytest.mark.parametrize('command', ['effort', 'velocity'])
+def test_it_crosses_a_change_point_on_its_branch(
+    command: str, steer: Drive, prototype: Mechanism,
+) -> None:
+    steered = steer(prototype, InitialState(0.1, 0.5), setpoint_duration=3.0, command=command,
+                    change_points='keep')
+    steered.controller.setpoint(['link_a', 'link_b'], [0.2, -0.3])
+    apart = []
+    for _ in range(1000):
+        steered.tick()
+        angles = steered.plant.truth().link_angles
+        apart.append(wrap_angles(angles[2:] - angles[:2]))
+    assert np.abs(apart).max() < 1e-3
+    np.testing.assert_allclose(steered.plant.truth().link_angles[:2], [0.2, -0.3], atol=1e-4)

@@ -1,0 +1,66 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The table of parameters and the settings are the same thing."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+from fourbar_ros.control import Controller, ControllerSettings
+from fourbar_ros.control.parameters import PARAMETERS, SETTINGS
+from fourbar_ros.control.settings import WHEEL_TARGETS
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.parameters import Parameter
+import pytest
+
+each_row = pytest.mark.parametrize('row', SETTINGS, ids=[row.name for row in SETTINGS])
+
+
+def test_rows_are_the_fields_of_the_settings_in_order() -> None:
+    assert [row.name for row in SETTINGS] == [field.name for field in fields(ControllerSettings)]
+    assert [row.name for row in PARAMETERS] == ['mechanism', *(row.name for row in SETTINGS)]
+
+
+@each_row
+def test_defaults_are_those_of_the_settings_and_are_allowed(row: Parameter) -> None:
+    assert row.default == getattr(ControllerSettings(), row.name)
+    assert (row.limits is None) != (row.choices is None)
+    if row.limits is not None:
+        assert row.limits[0] <= row.default <= row.limits[1]
+    else:
+        assert row.choices is not None
+        assert row.default in row.choices
+
+
+@each_row
+def test_everything_can_be_set_while_it_runs_and_says_what_it_is(row: Parameter) -> None:
+    assert row.live
+    assert row.meaning
+    assert not row.meaning.endswith('.')
+
+
+@pytest.mark.parametrize(('row', 'choice'), [
+    (row, choice) for row in SETTINGS for choice in row.choices or ()],
+    ids=[f'{row.name}-{choice}' for row in SETTINGS for choice in row.choices or ()])
+def test_every_choice_is_one_that_the_controller_takes(
+    row: Parameter, choice: str, prototype: Mechanism,
+) -> None:
+    controller = Controller(prototype, ControllerSettings())
+    controller.tune(ControllerSettings(**{row.name: choice}))  # type: ignore[arg-type]
+    assert getattr(controller.settings, row.name) == choice
+
+
+def test_wheels_may_be_left_free() -> None:
+    assert WHEEL_TARGETS[0] == ControllerSettings().wheel_target == 'free'
