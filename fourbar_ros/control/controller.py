@@ -161,6 +161,8 @@ class Controller:
     def enable(self, enabled: bool) -> None:
         """Drive the wheels when armed, from the next tick on; or leave them alone."""
         if enabled and not self._enabled and self._armed:
+            # What they did while nobody drove them says nothing.
+            self._forget_wheels()
             self.mode = 'damp'
             self._hold()
         self._enabled = enabled
@@ -317,8 +319,7 @@ class Controller:
         if not self._armed:
             self.mode = 'disarmed'
         elif was == 'disarmed':
-            self.wheels.begin()
-            self.law.tune(self.settings, self.wheels.usable)
+            self._forget_wheels()
             self._accounts.begin()
             self.momentum.begin(self.speeds)
             self.problem = ''
@@ -330,9 +331,14 @@ class Controller:
         if self.mode == 'hold' and was in ('disarmed', 'idle'):
             self._guide.begin(self.angles)
             self._drive.begin(self.speeds)
-            self.wheels.begin()
+            self._forget_wheels()
         elif self.mode in ('disarmed', 'idle'):
             self._guide.begin(self.angles)
+
+    def _forget_wheels(self) -> None:
+        """Think well of all wheels again, and share among all."""
+        self.wheels.begin()
+        self.law.tune(self.settings, self.wheels.usable)
 
     def _watch(self, period: float, link_rates: Array, speeds: Array, efforts: Array) -> None:
         """Look at the wheels; take out of the allocation which cannot be used any more."""
