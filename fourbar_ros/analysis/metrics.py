@@ -80,6 +80,10 @@ MEANINGS = {
     'energy.work_j': Meaning(
         'J', 'Mechanical work of the motors, the integral of |torque times relative speed|, '
         'accumulated since the setpoint.'),
+    'energy.copper_loss_j': Meaning(
+        'J', 'Heat in the windings of the motors, the integral of resistance times current squared '
+        'as the controller works it out, accumulated since the setpoint; 0 for motors whose '
+        'windings are not described.'),
     'loop.rate_hz': Meaning('Hz', 'Ticks per second of stamp time since the setpoint.'),
     'loop.ticks': Meaning('1', 'Ticks since the setpoint.'),
     'loop.round_trip_p50_ms': Meaning(
@@ -151,8 +155,8 @@ def _measurements(recording: Recording, motion: Motion,
         (('flywheel.peak_torque_n_m',), lambda: _peak_torque(recording, motion)),
         (('flywheel.peak_energy_j', 'flywheel.final_energy_j'),
          lambda: _peak_and_last(flywheel_energy(recording, motion, mechanism)[1])),
-        (('energy.peak_flywheel_energy_j', 'energy.eq9_j_s', 'energy.work_j'),
-         lambda: _energy(recording, motion)),
+        (('energy.peak_flywheel_energy_j', 'energy.eq9_j_s', 'energy.work_j',
+          'energy.copper_loss_j'), lambda: _energy(recording, motion)),
         (('loop.ticks', 'loop.rate_hz', 'loop.unrecorded_ticks'),
          lambda: _ticks(recording, motion)),
         (('loop.round_trip_p50_ms', 'loop.round_trip_p99_ms', 'loop.round_trip_max_ms'),
@@ -255,9 +259,12 @@ def _peak_torque(recording: Recording, motion: Motion) -> tuple[float, ...]:
 
 
 def _energy(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    energy, eq9, work = _within(recording, motion, 'energy').select(
-        ('flywheel_energy_j', 'eq9_j_s', 'work_j')).position.T
-    return float(np.nanmax(energy)), _growth(eq9), _growth(work)
+    energy, eq9, work, copper = _within(recording, motion, 'energy').select(
+        ('flywheel_energy_j', 'eq9_j_s', 'work_j', 'copper_loss_j')).position.T
+    # Recordings from before it was told have none.
+    told = np.isfinite(copper).any()
+    return (float(np.nanmax(energy)), _growth(eq9), _growth(work),
+            _growth(copper) if told else np.nan)
 
 
 def _ticks(recording: Recording, motion: Motion) -> tuple[float, ...]:

@@ -41,7 +41,7 @@ STATUSES = ('device_status', 'controller_status')
 JOINTS = (
     'link_angles', 'flywheel_states', 'flywheel_command', 'timing', 'sim/link_states',
     'sim/flywheel_states', 'estimate/link_states', 'estimate/sigma', 'estimate/innovation',
-    'reference', 'tracking_error', 'energy',
+    'reference', 'tracking_error', 'energy', 'allocation', 'momentum',
 )
 
 WATCHED = ('flywheel_states', 'estimate/link_states')

@@ -159,8 +159,8 @@ def motion_messages(rate_hz=50, namespace='', seed=0, mechanism='paper'):
         add('tracking_error', now + 8, joint_state(stamp, LINKS, difference))
         past = max(second, 0.0)
         add('energy', now + 9, joint_state(
-            stamp, ['flywheel_energy_j', 'eq9_j_s', 'work_j'],
-            [energy[row], 2e-3 * past, 5e-4 * past]))
+            stamp, ['flywheel_energy_j', 'eq9_j_s', 'work_j', 'copper_loss_j'],
+            [energy[row], 2e-3 * past, 5e-4 * past, 3e-4 * past]))
     return topics
 
 

@@ -104,6 +104,7 @@ def test_energy_counts_from_the_setpoint(result, synthetic):
     seconds = synthetic.STEP_S + synthetic.AFTER_S
     assert result['energy']['eq9_j_s'] == pytest.approx(2e-3 * seconds)
     assert result['energy']['work_j'] == pytest.approx(5e-4 * seconds)
+    assert result['energy']['copper_loss_j'] == pytest.approx(3e-4 * seconds)
 
 
 def test_loop(result, motion_bag):
@@ -219,6 +220,16 @@ def test_optional_topic_costs_its_metrics_and_no_other(motion_with, result, topi
     for name in set(MEANINGS) - lost:
         group, key = name.split('.')
         assert poorer[group][key] == result[group][key]
+
+
+def test_recording_from_before_copper_losses_were_told_lacks_nothing_else(motion_with, result):
+    def older(messages):
+        for _, message in messages['/energy']:
+            del message.name[-1]
+            message.position = message.position[:-1]
+    poorer = metrics(motion_with(older), PAPER)
+    assert set(poorer['missing']) == {'energy.copper_loss_j'}
+    assert poorer['energy']['work_j'] == result['energy']['work_j']
 
 
 @pytest.mark.parametrize(

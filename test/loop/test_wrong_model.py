@@ -1,0 +1,83 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The prototype moves and rests as it should with a model of it that is 5 % wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import pi
+
+from fourbar_ros.control import Controller
+from fourbar_ros.estimation import Estimator
+from fourbar_ros.loop import (
+    ClosedLoop,
+    load_scenario,
+    make_loop,
+    run_scenario,
+    ScriptedSetpoint,
+)
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+
+BEGIN, DURATION, SETTLING, REST = 0.4, 10.0, 1.0, 10.0
+RATE = 250.0
+LARGEST_RMS, LARGEST_AT_THE_END, LARGEST_SWING = 0.15, 0.1, 0.12
+
+
+def tracking(links: float, wheels: float, by: tuple[float, float]) -> Array:
+    """
+    Make one move on the table with friction, drag, tilt and late sensors, and then rest.
+
+    :param links, wheels: inertias that the controller believes in, as shares of the true ones.
+    :param by: travel of links a and b [rad].
+    :returns: (ticks, 4) reference less true angles [deg].
+    """
+    scenario = load_scenario('prototype')
+    true = scenario.mechanism
+    start = scenario.initial.link_a, scenario.initial.link_b
+    scenario = replace(
+        scenario, duration=BEGIN + DURATION + SETTLING + REST,
+        setpoints=(ScriptedSetpoint(BEGIN, ('link_a', 'link_b'), (
+            start[0] + by[0], start[1] + by[1]), DURATION),))
+    wrong = replace(true, link_inertias=links * true.link_inertias,
+                    flywheel_inertias=wheels * true.flywheel_inertias)
+    loop = ClosedLoop(make_loop(scenario).testbed, Estimator(true, scenario.estimator),
+                      Controller(wrong, scenario.controller))
+    errors = np.full((scenario.ticks, 4), np.nan)
+    for tick, step in enumerate(run_scenario(scenario, loop)):
+        if step.control is not None and step.samples.truth is not None:
+            errors[tick] = step.control.reference_angles - step.samples.truth.link_angles
+    assert loop.controller.mode == 'hold'
+    assert loop.controller.saturated == 0
+    assert loop.testbed.gate.armed
+    return np.degrees(errors)
+
+
+@pytest.mark.parametrize('by', [(pi / 2, pi / 2), (0.0, pi / 4)], ids=['whole', 'configuration'])
+@pytest.mark.parametrize(('links', 'wheels'), [(1.05, 0.95), (0.95, 1.05)])
+def test_errors_stay_small_and_at_rest_it_does_not_hunt(
+    links: float, wheels: float, by: tuple[float, float],
+) -> None:
+    """Both inertias wrong to different sides, which makes most of the wrong torque."""
+    errors = tracking(links, wheels, by)
+    begin, end = round((BEGIN + 0.01) * RATE), round((BEGIN + DURATION + SETTLING) * RATE)
+    assert np.sqrt((errors[begin:end] ** 2).mean(axis=0)).max() <= LARGEST_RMS
+    resting = errors[end:]
+    assert len(resting) >= REST * RATE
+    assert np.abs(resting).max() <= LARGEST_AT_THE_END
+    assert np.ptp(resting, axis=0).max() <= LARGEST_SWING
