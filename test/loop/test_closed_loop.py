@@ -18,6 +18,7 @@ from collections.abc import Callable
 from math import pi
 
 from fourbar_ros.control import Controller, ControllerSettings
+from fourbar_ros.control.accounts import FLYWHEEL_ENERGY
 from fourbar_ros.device import DeviceState, SimulatedTable, Testbed, TestbedSettings
 from fourbar_ros.estimation import Estimator, EstimatorSettings
 from fourbar_ros.loop import ClosedLoop, Step
@@ -112,7 +113,7 @@ def test_quarter_turn_of_the_paper(make_loop: MakeLoop) -> None:
     check_tracking(loop, steps)
     speeds = np.abs([absolute_speeds(step) for step in steps]).max(axis=0)
     assert speeds == pytest.approx(np.full(4, PEAK), rel=0.1)
-    energy = max(step.control.flywheel_energy for step in steps if step.control)
+    energy = max(step.control.energies[FLYWHEEL_ENERGY] for step in steps if step.control)
     assert energy == pytest.approx(2.6452e-3, rel=0.1)
 
 

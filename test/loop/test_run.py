@@ -17,6 +17,7 @@
 from dataclasses import replace
 from math import pi
 
+from fourbar_ros.control import WheelCommand
 from fourbar_ros.loop import (
     ClosedLoop,
     load_scenario,
@@ -24,6 +25,7 @@ from fourbar_ros.loop import (
     Recording,
     run_scenario,
     RunError,
+    Scenario,
     ScriptedSetpoint,
     Step,
 )
@@ -47,9 +49,17 @@ def test_preset_makes_its_quarter_turn(name: str) -> None:
     # Ticks before the first sample arrived have none.
     assert np.abs((wanted - true[-len(wanted):])[100:]).max() < HALF_A_DEGREE
     # Peak of the soft step's rate times inertia of a pair, by two wheels; the prototype's number
-    # is that of its file.
-    peak = np.abs(found['sim/flywheel_states.velocity']).max()
-    assert peak == pytest.approx({'paper': 62.37, 'prototype': 48.0}[name], rel=0.1)
+    # is that of its file. Friction in the joints moves momentum between its pairs, so it is the
+    # mean of both.
+    speeds = found['sim/flywheel_states.velocity']
+    peak = np.abs(speeds.mean(axis=1)).max()
+    assert peak == pytest.approx({'paper': 62.37, 'prototype': 48.0}[name], rel=0.05)
+    assert np.abs(speeds).max() < 1.3 * peak
+    # How its command is written: of what a message leaves out there is no number.
+    given, left_out = ('effort', 'velocity') if name == 'paper' else ('velocity', 'effort')
+    driven = found[f'flywheel_command.{given}'][100:]
+    assert np.isfinite(driven).all()
+    assert np.isnan(found[f'flywheel_command.{left_out}'][100:]).all()
 
 
 @pytest.mark.parametrize('heading', ['link_a', 'link_d'])
@@ -70,9 +80,17 @@ def test_joint_encoders_and_one_heading_serve_as_well(heading: str) -> None:
     assert (~np.isnan(innovations)).mean() > 0.95
 
 
+def strong_scenario() -> Scenario:
+    """Give the linkage of the paper motors that bear moves within half a second."""
+    scenario = load_scenario('paper')
+    return replace(scenario, mechanism=replace(
+        scenario.mechanism, motor_torque_limits=np.full(4, 1e-2),
+        motor_speed_limits=np.full(4, 5e4)))
+
+
 def test_script_acts_from_the_next_tick_on() -> None:
     scenario = replace(
-        load_scenario('paper'), arm_at=0.1, duration=0.5,
+        strong_scenario(), arm_at=0.1, duration=0.5,
         setpoints=(ScriptedSetpoint(0.199, ('link_a',), (0.1,), 0.2),))
     found = record_run(scenario).arrays()
     commanded = np.flatnonzero(found['flywheel_command.effort'].any(axis=1))
@@ -86,7 +104,7 @@ def test_script_acts_from_the_next_tick_on() -> None:
 
 
 def test_duration_of_a_setpoint_holds_for_it_alone() -> None:
-    base = load_scenario('paper')
+    base = strong_scenario()
     scenario = replace(
         base, arm_at=0.1, duration=1.0,
         controller=replace(base.controller, setpoint_duration=0.4),
@@ -205,3 +223,24 @@ def test_steps_pass_through_whoever_watches() -> None:
             yield step
     recording = record_run(replace(load_scenario('paper'), duration=0.02), watch)
     assert seen == [6, *recording.tick_stamps_ns]
+
+
+def test_command_of_a_wheel_without_power_stays_empty() -> None:
+    """Neither torque nor speed, while the others have theirs; an unarmed loop commands torques."""
+    scenario = replace(load_scenario('prototype'), duration=0.02)
+    steps = list(run_scenario(scenario))[-2:]
+    values, powered = np.array([1.0, 2.0, 3.0, 4.0]), np.array([True, False, True, True])
+    recording = Recording(scenario.table.link_sensors.sensor_names)
+    for by_speed, step in zip((False, True), steps):
+        assert step.control is not None
+        recording.add(replace(step, control=replace(
+            step.control, command=WheelCommand(values, by_speed, powered))))
+    found = recording.arrays()
+    left = [1.0, np.nan, 3.0, 4.0]
+    np.testing.assert_array_equal(found['flywheel_command.effort'], [left, [np.nan] * 4])
+    np.testing.assert_array_equal(found['flywheel_command.velocity'], [[np.nan] * 4, left])
+    names, *lines = (line.rstrip('\n').split(',') for line in recording.lines())
+    torques, speeds = ([[dict(zip(names, line))[f'{prefix}{link}'] for link in 'abcd']
+                        for line in lines] for prefix in ('command_', 'command_speed_'))
+    assert torques == [['1', '', '3', '4'], [''] * 4]
+    assert speeds == [[''] * 4, ['1', '', '3', '4']]
