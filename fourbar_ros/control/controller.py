@@ -208,7 +208,8 @@ class Controller:
                 step = self._shortest(step)
             else:
                 check_needs(self.mechanism, step, guide.angles,
-                            self._wheels_after(step.duration), crossing=crossing)
+                            self._wheels_after(step.duration), share=self.law.share,
+                            crossing=crossing)
         except SetpointError as error:
             self._refuse(error)
             raise
@@ -233,7 +234,7 @@ class Controller:
                 self.mechanism, names, points, guide.motion.copy(), guide.angles,
                 guide.destination, crossing=crossing)
             check_needs(self.mechanism, way, guide.angles, self._wheels_after(way.duration),
-                        crossing=crossing)
+                        share=self.law.share, crossing=crossing)
         except SetpointError as error:
             self._refuse(error)
             raise
@@ -376,7 +377,7 @@ class Controller:
         try:
             shortest = shortest_duration(
                 self.mechanism, guide.motion.copy(), goal[:2], guide.angles,
-                self._wheels_after(0.0), crossing=self._crossing)
+                self._wheels_after(0.0), share=self.law.share, crossing=self._crossing)
             if shortest > left:
                 move = SoftStep(guide.motion.copy(), goal[:2], shortest)
                 follow(self.mechanism, move, guide.angles, crossing=self._crossing)
@@ -408,7 +409,7 @@ class Controller:
         guide = self._guide
         duration = shortest_duration(
             self.mechanism, move.start, move.goal, guide.angles, self._wheels_after(0.0),
-            crossing=self._crossing)
+            share=self.law.share, crossing=self._crossing)
         shortest = SoftStep(move.start, move.goal, duration)
         follow(self.mechanism, shortest, guide.angles, crossing=self._crossing)
         return shortest

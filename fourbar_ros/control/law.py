@@ -43,9 +43,9 @@ from numpy.typing import NDArray
 AXES = ('a', 'b')
 """The axes by the links that they are named after; in a parallelogram c goes with a, d with b."""
 
-# Of what a motor can give, so much is shared out; the rest is for friction and for the loop that
-# follows speeds.
-SHARED_OUT = 0.95
+# Of what a motor can give, so much is shared out. The loop that follows speeds needs room: in the
+# limit it forgets what it has learnt.
+SHARED_OUT = {'effort': 0.98, 'velocity': 0.85}
 
 # A wheel is not driven so that it would reach its speed limit sooner than this [s].
 HORIZON = 0.1
@@ -80,13 +80,14 @@ class Decision:
 
 
 @kernel
-def motor_bounds(speeds: Array, friction: Array, boxed: NDArray[np.record], lower: Array,
-                 upper: Array) -> None:
+def motor_bounds(speeds: Array, friction: Array, share: float, boxed: NDArray[np.record],
+                 lower: Array, upper: Array) -> None:
     """
     Evaluate what the motors can give now, friction of the bearings deducted.
 
     :param speeds: (4,) relative to the links [rad/s].
     :param friction: (4,) what the bearings take, against the speed [N m].
+    :param share: of it that is shared out.
     :param lower, upper: (4,) receive it; zero is always between them [N m].
     """
     motors = boxed[0]
@@ -98,7 +99,7 @@ def motor_bounds(speeds: Array, friction: Array, boxed: NDArray[np.record], lowe
             back = motors.torque_constant[j] * speeds[j]
             low = max(low, slope * (-motors.voltage[j] - back))
             high = min(high, slope * (motors.voltage[j] - back))
-        low, high = SHARED_OUT * low - friction[j], SHARED_OUT * high - friction[j]
+        low, high = share * low - friction[j], share * high - friction[j]
         gain = motors.inertia[j] / HORIZON
         lower[j] = min(max(low, gain * (-motors.speed_limit[j] - speeds[j])), 0.0)
         upper[j] = max(min(high, gain * (motors.speed_limit[j] - speeds[j])), 0.0)
@@ -168,12 +169,15 @@ class TrackingLaw:
     :param mechanism: the linkage that the controller believes in.
     :ivar decision: what was decided last.
     :ivar usable: (4,) bool, wheels that may be used; see :meth:`tune`.
+    :ivar mobilities: (4,) metric of the allocation, 0 for a wheel that is not used.
+    :ivar share: of what the motors can give, that is shared out.
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
         self.decision = Decision()
         self.usable = np.ones(4, dtype=bool)
         self.mobilities = np.zeros(4)
+        self.share = 1.0
         self._mechanism = mechanism
         self._constants = np.array([mechanism.with_rigid_joints().constants])
         self._motors = np.array([motors_of(mechanism)])
@@ -194,6 +198,7 @@ class TrackingLaw:
         self.mobilities = mobilities(settings.allocation, inertias, usable)
         self._free_mobilities = mobilities('min_energy', inertias, usable)
         self._bounded = settings.allocation == 'bounded'
+        self.share = SHARED_OUT[settings.command]
         self.usable = usable
         numbers = self._numbers
         numbers[STIFFNESS] = settings.bandwidth ** 2
@@ -223,7 +228,8 @@ class TrackingLaw:
         wanted = self._wanted_speeds
         if self._target in ('zero', 'bias'):
             wanted = target_speeds(self._target, rates, self._bias)
-        motor_bounds(wheel_speeds, friction, self._motors, found.lower, found.upper)
+        motor_bounds(
+            wheel_speeds, friction, self.share, self._motors, found.lower, found.upper)
         found.scale = decide(
             angles, rates, guide.angles, guide.rates, guide.accelerations, disturbance, wanted,
             wheel_speeds + rates, numbers, guide.parallel, self._constants, self.mobilities,

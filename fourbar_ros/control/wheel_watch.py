@@ -48,6 +48,9 @@ HEALTHY, DEGRADED, DEAD, STUCK, RUNAWAY, SHORTED = range(len(VERDICTS))
 # is broken or degraded.
 UNFOLLOWED = 2.5
 UNFOLLOWED_TICKS = 4
+# So much more is allowed [rad/s] of a motor that was strained so lately [s]: what its own loop does
+# in the limit is known less well.
+OF_STRAINED, JUST_STRAINED = 10.0, 0.3
 
 # Time constants of means [s]: for a wheel that breaks, and for one that degrades; with which a
 # healthy one is learnt, and the model of a wheel that is driven by torque led back to it, since
@@ -69,8 +72,9 @@ MISSING_BY_SPEED, REPLICA_SLOW = 0.25, 5.0
 # difference is more than this share of the limit.
 BEHIND, EXPLAINED_BETTER, VISIBLE = 0.35, 4.0, 5e-4
 
-# Degradation must last so long to be said [s].
-PERSISTENT = 0.5
+# Degradation must last so long to be said [s], and is not looked at while the motor gives more than
+# this share of its limit, nor for so long afterwards [s].
+PERSISTENT, STRAINED, AFTER_STRAIN = 0.5, 0.5, 2.0
 
 # The friction of slower wheels is not known [rad/s], nor that of one which was slow so lately [s].
 SLOWEST, AFTER_SLOW = 5.0, 0.8
@@ -93,8 +97,8 @@ STEP = 1e-3
 # What is kept of each wheel.
 (MODEL_SPEED, MODEL_TORQUE, INTEGRAL, LAST_SPEED, LAST_RATE, AGAINST, EFFORT, EXPECTED, GAIN,
  LONG_EFFORT, LONG_EXPECTED, LONG_GAIN, LONG_BEHIND, LEARNT, LEARNT_GAIN, REPLICA, REPLICA_TORQUE,
- SUSPECT_FOR, FAST_FOR, CUT_FOR, KNOWN, LOST) = range(22)
-COLUMNS = 22
+ SUSPECT_FOR, FAST_FOR, CUT_FOR, KNOWN, LOST, SETTLED) = range(23)
+COLUMNS = 23
 
 
 class WheelWatch:
@@ -158,7 +162,7 @@ def _begin(kept: Array, past: Array, late: Array, speeds: Array, rates: Array) -
     kept[:], past[:], late[:] = 0.0, 0.0, 0.0
     for j in range(4):
         kept[j, MODEL_SPEED] = kept[j, LAST_SPEED] = speeds[j]
-        kept[j, LAST_RATE] = rates[j]
+        kept[j, LAST_RATE], kept[j, SETTLED] = rates[j], AFTER_STRAIN
         kept[j, INTEGRAL] = kept[j, REPLICA] = nan
 
 
@@ -198,7 +202,11 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
         asked, behind = _follow_model(
             j, wheel, commands[j], by_speed, speed, turned, period, friction, boxed)
         wheel[EXPECTED] += short * (asked - wheel[EXPECTED])
-        wheel[AGAINST] = wheel[AGAINST] + 1.0 if abs(behind) > UNFOLLOWED else 0.0
+        wheel[SETTLED] += period
+        if max(abs(wheel[EFFORT]), abs(wheel[EXPECTED])) > STRAINED * limit:
+            wheel[SETTLED] = 0.0
+        allowed = UNFOLLOWED + (OF_STRAINED if wheel[SETTLED] < JUST_STRAINED else 0.0)
+        wheel[AGAINST] = wheel[AGAINST] + 1.0 if abs(behind) > allowed else 0.0
         if wheel[AGAINST] >= UNFOLLOWED_TICKS:
             verdicts[j] = max(before, _broken(wheel, speed, limit, friction))
             wheel[MODEL_SPEED], wheel[AGAINST] = speed, 0.0
@@ -313,8 +321,9 @@ def _degraded(j: int, wheel: Array, asked: float, by_speed: bool, speed: float, 
         tardy = late[0] > max(EXPLAINED_BETTER * best, (VISIBLE * limit) ** 2)
     rubbing = (friction[0] > 0.0 and wheel[FAST_FOR] > AFTER_SLOW
                and _rubs(wheel, speed, limit, period))
-    looked_at = max(abs(wheel[LONG_EFFORT]), abs(wheel[LONG_EXPECTED])) > LOOKED_AT * limit
-    if looked_at and (missing or tardy or rubbing):
+    # A share of little is no evidence.
+    missing &= max(abs(wheel[LONG_EFFORT]), abs(wheel[LONG_EXPECTED])) > LOOKED_AT * limit
+    if wheel[SETTLED] > AFTER_STRAIN and (missing or tardy or rubbing):
         wheel[SUSPECT_FOR] += period
     else:
         wheel[SUSPECT_FOR] = 0.0
@@ -347,7 +356,7 @@ def _replicate(j: int, wheel: Array, command: float, speed: float, effort: float
     """
     motors = boxed[0]
     limit = motors.torque_limit[j]
-    if not abs(wheel[REPLICA]) <= limit:
+    if not abs(wheel[REPLICA]) <= limit or wheel[SETTLED] < AFTER_STRAIN:
         wheel[REPLICA] = effort - SPEED_BANDWIDTH * motors.inertia[j] * (command - speed)
     asked, wheel[REPLICA] = speed_loop(j, command, speed, wheel[REPLICA], period, motors)
     wheel[REPLICA] += (effort - asked) * period / REPLICA_SLOW
