@@ -39,7 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='checks and numbers, units in their names (also in FOLDER as NAME.json)')
     drawn = parser.add_argument_group('studies that draw at random')
     drawn.add_argument('--runs', metavar='N', type=int,
-                       help='runs of each kind (default 100, for which the limits are made)')
+                       help='runs of each kind (default as many as the limits are made for: '
+                            '100, of crossing 300)')
     drawn.add_argument('--seed', metavar='S', type=int,
                        help='of the first run of each kind, the others follow it (default 0)')
     drawn.add_argument('--jobs', metavar='N', type=int,

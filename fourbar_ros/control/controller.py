@@ -354,8 +354,9 @@ class Controller:
         self.law.tune(self.settings, usable)
         lost = self.law.lost_axes()
         if lost:
-            self.problem = (f'axis {" and ".join(lost)} is lost: '
-                            f'{", ".join(self.wheels.findings())} cannot be used')
+            broken = [name for name, use in zip(FLYWHEEL_NAMES, usable) if not use]
+            self.problem = (f'axis {" and ".join(lost)} is lost: {", ".join(broken)} cannot be '
+                            'used')
             self._hold()
         elif self._guide.moving and self.mode == 'track':
             self._go_on()

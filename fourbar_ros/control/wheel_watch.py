@@ -52,15 +52,17 @@ UNFOLLOWED_TICKS = 4
 # Time constants of means [s]: for a wheel that breaks, and for one that degrades; with which a
 # healthy one is learnt, and the model of a wheel that is driven by torque led back to it, since
 # errors of the friction add up there.
-SHORT, LONG, SLOW = 0.02, 0.5, 5.0
+SHORT, LONG, SLOW, VERY_SLOW = 0.02, 0.5, 5.0, 30.0
 
 # In shares of the motor's torque limit: degradation is looked at from this effort on; torque that
 # friction takes; a motor that gives nothing; one that gives what nobody asked for; a brake.
-LOOKED_AT, FRICTION_LOSS, NOTHING, UNASKED, BRAKED = 0.04, 1e-3, 2e-3, 0.04, 0.1
+LOOKED_AT, FRICTION_LOSS, NOTHING, UNASKED, BRAKED = 0.04, 8e-4, 2e-3, 0.04, 0.1
 
 # Shares of the expected torque: that of a dead motor at most, and what a healthy one may lack; of
 # the measured change of torque, by how much the inertia of a wheel may be believed wrongly.
-DEAD_SHARE, MISSING, INERTIA_ERROR = 0.15, 0.2, 0.08
+DEAD_SHARE, MISSING, INERTIA_ERROR = 0.15, 0.2, 0.06
+# Of what a motor's own loop asks for a replica knows less, since it sees the speed less often.
+MISSING_BY_SPEED, REPLICA_SLOW = 0.25, 5.0
 
 # A wheel that follows speeds is late if it is so far behind on the mean [rad/s]; one that follows
 # torques, if some delay explains its effort better than none by this factor, in squares, and the
@@ -71,7 +73,7 @@ BEHIND, EXPLAINED_BETTER, VISIBLE = 0.35, 4.0, 5e-4
 PERSISTENT = 0.5
 
 # The friction of slower wheels is not known [rad/s], nor that of one which was slow so lately [s].
-SLOWEST, AFTER_SLOW = 5.0, 1.5
+SLOWEST, AFTER_SLOW = 5.0, 0.8
 
 # At most this slow, a wheel that is pushed stands still [rad/s].
 STANDING = 1.0
@@ -82,14 +84,17 @@ CUT_WITHIN = 0.15
 # Delays of commands that are thought of, in ticks: from the first to the last.
 FIRST_DELAY, DELAYS = 3, 32
 
+# The loop in the motor's electronics is taken to see the speed as often as this [s].
+LOOP_STEP = 5e-4
+
 # Longest step of the model [s].
 STEP = 1e-3
 
 # What is kept of each wheel.
 (MODEL_SPEED, MODEL_TORQUE, INTEGRAL, LAST_SPEED, LAST_RATE, AGAINST, EFFORT, EXPECTED, GAIN,
  LONG_EFFORT, LONG_EXPECTED, LONG_GAIN, LONG_BEHIND, LEARNT, LEARNT_GAIN, REPLICA, REPLICA_TORQUE,
- SUSPECT_FOR, FAST_FOR, CUT_FOR, KNOWN) = range(21)
-COLUMNS = 21
+ SUSPECT_FOR, FAST_FOR, CUT_FOR, KNOWN, LOST) = range(22)
+COLUMNS = 22
 
 
 class WheelWatch:
@@ -175,7 +180,8 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
         wheel, before = kept[j], verdicts[j]
         inertia, limit = motors.inertia[j], motors.torque_limit[j]
         speed, turned = speeds[j], rates[j] - wheel[LAST_RATE]
-        gain = inertia * (speed - wheel[LAST_SPEED] + turned) / period
+        gained = speed - wheel[LAST_SPEED]
+        gain = inertia * (gained + turned) / period
         wheel[LAST_SPEED], wheel[LAST_RATE] = speed, rates[j]
         wheel[EFFORT] += short * (efforts[j] - wheel[EFFORT])
         wheel[GAIN] += short * (gain - wheel[GAIN])
@@ -183,8 +189,8 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
             _without_power(wheel, speed, period)
             if verdicts[j] == RUNAWAY and wheel[CUT_FOR] > CUT_WITHIN:
                 # Friction brakes it: anything else is driven.
-                driven = copysign(1.0, speed) * wheel[GAIN] > 0.0
-                if driven and abs(wheel[GAIN]) > 0.5 * UNASKED * limit:
+                if (abs(speed) > SLOWEST and copysign(1.0, speed) * wheel[GAIN] > UNASKED * limit
+                        or abs(wheel[EFFORT]) > UNASKED * limit):
                     verdicts[j] = SHORTED
             changed |= verdicts[j] != before
             continue
@@ -198,7 +204,7 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
             wheel[MODEL_SPEED], wheel[AGAINST] = speed, 0.0
         if verdicts[j] == HEALTHY and _degraded(
                 j, wheel, asked, by_speed, speed, behind, efforts[j], gain, commands[j], period,
-                long, friction, boxed, past[j], late[j]):
+                long, gained, friction, boxed, past[j], late[j]):
             verdicts[j] = DEGRADED
         changed |= verdicts[j] != before
     return changed
@@ -252,13 +258,15 @@ def _follow_model(j: int, wheel: Array, command: float, by_speed: bool, speed: f
 def _broken(wheel: Array, speed: float, limit: float, friction: Array) -> int:
     """Tell what is the matter with a wheel that does not follow."""
     effort, expected = wheel[EFFORT], wheel[EXPECTED]
-    if abs(effort) < DEAD_SHARE * abs(expected) + NOTHING * limit:
+    nothing = NOTHING * limit
+    if (abs(effort) < DEAD_SHARE * abs(expected) + nothing
+            and abs(effort - expected) > 2.0 * nothing):
         return DEAD
     taken = copysign(friction[0], speed) + friction[1] * speed if abs(speed) > STANDING else 0.0
     lost = effort - taken - wheel[GAIN]
     dry = friction[0]
     if abs(lost) > max(5.0 * dry, BRAKED * limit) or (
-            abs(speed) < STANDING and abs(effort) > 3.0 * dry + NOTHING * limit
+            abs(speed) < STANDING and abs(effort) > 3.0 * dry + nothing
             and abs(lost) > 0.5 * abs(effort)):
         return STUCK
     unasked = abs(effort - expected) > UNASKED * limit + 0.5 * abs(expected)
@@ -270,12 +278,13 @@ def _broken(wheel: Array, speed: float, limit: float, friction: Array) -> int:
 @kernel
 def _degraded(j: int, wheel: Array, asked: float, by_speed: bool, speed: float, behind: float,
               effort: float, gain: float, command: float, period: float, long: float,
-              friction: Array, boxed: NDArray[np.record], past: Array, late: Array) -> bool:
+              gained: float, friction: Array, boxed: NDArray[np.record], past: Array, late: Array) -> bool:
     """Tell whether a wheel lacks torque or acts late, for long enough to say so."""
     motors = boxed[0]
     limit = motors.torque_limit[j]
     if by_speed:
-        asked = _replicate(j, wheel, command, speed, effort, period, boxed)
+        seen = speed - 0.5 * gained * LOOP_STEP / period
+        asked = _replicate(j, wheel, command, seen, effort, period, boxed)
     for delay in range(DELAYS - 1, 0, -1):
         past[delay] = past[delay - 1]
     past[0] = asked
@@ -290,13 +299,19 @@ def _degraded(j: int, wheel: Array, asked: float, by_speed: bool, speed: float, 
         if delay >= FIRST_DELAY:
             best = min(best, late[delay])
     wheel[FAST_FOR] = wheel[FAST_FOR] + period if abs(speed) > SLOWEST else 0.0
+    if wheel[FAST_FOR] > 0.0:
+        lost = (effort - gain) * copysign(1.0, speed) - friction[0] - friction[1] * abs(speed)
+        # Nothing is known at first: then the plain mean.
+        share = long if wheel[KNOWN] else max(long, period / wheel[FAST_FOR])
+        wheel[LOST] += share * (lost - wheel[LOST])
     missing = abs(wheel[LONG_EXPECTED] - wheel[LONG_EFFORT]) > (
-        MISSING * abs(wheel[LONG_EXPECTED]) + NOTHING * limit)
+        (MISSING_BY_SPEED if by_speed else MISSING) * abs(wheel[LONG_EXPECTED])
+        + NOTHING * limit)
     if by_speed:
         tardy = abs(wheel[LONG_BEHIND]) > BEHIND
     else:
         tardy = late[0] > max(EXPLAINED_BETTER * best, (VISIBLE * limit) ** 2)
-    rubbing = wheel[FAST_FOR] > AFTER_SLOW and _rubs(wheel, speed, limit, period, friction)
+    rubbing = friction[0] > 0.0 and wheel[FAST_FOR] > AFTER_SLOW and _rubs(wheel, speed, limit, period)
     looked_at = max(abs(wheel[LONG_EFFORT]), abs(wheel[LONG_EXPECTED])) > LOOKED_AT * limit
     if looked_at and (missing or tardy or rubbing):
         wheel[SUSPECT_FOR] += period
@@ -306,18 +321,17 @@ def _degraded(j: int, wheel: Array, asked: float, by_speed: bool, speed: float, 
 
 
 @kernel
-def _rubs(wheel: Array, speed: float, limit: float, period: float, friction: Array) -> bool:
+def _rubs(wheel: Array, speed: float, limit: float, period: float) -> bool:
     """Tell whether friction takes more than it used to, and learn what it is used to."""
-    lost = (wheel[LONG_EFFORT] - wheel[LONG_GAIN]) * copysign(1.0, speed) - (
-        friction[0] + friction[1] * abs(speed))
     accelerated = wheel[LONG_GAIN] * copysign(1.0, speed)
     if wheel[KNOWN] == 0.0:
-        wheel[LEARNT], wheel[LEARNT_GAIN], wheel[KNOWN] = lost, accelerated, 1.0
+        wheel[LEARNT], wheel[LEARNT_GAIN], wheel[KNOWN] = wheel[LOST], accelerated, 1.0
     allowed = FRICTION_LOSS * limit + INERTIA_ERROR * abs(accelerated - wheel[LEARNT_GAIN])
-    if lost - wheel[LEARNT] > allowed:
+    if wheel[LOST] - wheel[LEARNT] > allowed:
         return True
-    share = period / SLOW
-    wheel[LEARNT] += share * (lost - wheel[LEARNT])
+    # What is about to be too much is not learnt as usual.
+    share = period / (SLOW if wheel[LOST] - wheel[LEARNT] < 0.5 * allowed else VERY_SLOW)
+    wheel[LEARNT] += share * (wheel[LOST] - wheel[LEARNT])
     wheel[LEARNT_GAIN] += share * (accelerated - wheel[LEARNT_GAIN])
     return False
 
@@ -335,7 +349,7 @@ def _replicate(j: int, wheel: Array, command: float, speed: float, effort: float
     if not abs(wheel[REPLICA]) <= limit:
         wheel[REPLICA] = effort - SPEED_BANDWIDTH * motors.inertia[j] * (command - speed)
     asked, wheel[REPLICA] = speed_loop(j, command, speed, wheel[REPLICA], period, motors)
-    wheel[REPLICA] += (effort - asked) * period / SLOW
+    wheel[REPLICA] += (effort - asked) * period / REPLICA_SLOW
     mean, wheel[REPLICA_TORQUE] = lagged_torque(
         j, wheel[REPLICA_TORQUE], asked, period, motors)
     return mean

@@ -46,8 +46,8 @@ def make_loop(scenario: Scenario) -> ClosedLoop:
                   np.random.default_rng(scenario.seed))
     testbed = Testbed(SimulatedTable(plant, settings.period_ns), TestbedSettings(
         settings.command_timeout, settings.sensor_timeout, settings.timeout_action))
-    return ClosedLoop(testbed, Estimator(scenario.mechanism, scenario.estimator),
-                      Controller(scenario.mechanism, scenario.controller))
+    return ClosedLoop(testbed, Estimator(scenario.believed, scenario.estimator),
+                      Controller(scenario.believed, scenario.controller))
 
 
 def run_scenario(scenario: Scenario, loop: ClosedLoop | None = None) -> Iterator[Step]:

@@ -99,8 +99,9 @@ class Scenario:
     """
     A run of the closed loop.
 
-    :param mechanism_name, table_name: presets, or absolute paths of files.
+    :param mechanism_name, table_name, believed_name: presets, or absolute paths of files.
     :param mechanism, table: what is in them.
+    :param believed: the linkage that estimator and controller believe to have.
     :param initial: where the linkage starts.
     :param plant, estimator, controller: parameters of the nodes.
     :param arm_at: when the device is armed, after the first tick, None for never [s].
@@ -112,6 +113,8 @@ class Scenario:
 
     mechanism_name: str
     mechanism: Mechanism
+    believed_name: str
+    believed: Mechanism
     table_name: str
     table: Table
     initial: InitialState
@@ -143,8 +146,8 @@ class Scenario:
         return {
             'plant': {'mechanism': self.mechanism_name, 'table': self.table_name,
                       'seed': self.seed, **asdict(self.plant), **initial},
-            'estimator': {'mechanism': self.mechanism_name, **asdict(self.estimator)},
-            'controller': {'mechanism': self.mechanism_name, **asdict(self.controller)},
+            'estimator': {'mechanism': self.believed_name, **asdict(self.estimator)},
+            'controller': {'mechanism': self.believed_name, **asdict(self.controller)},
         }
 
 
@@ -172,7 +175,7 @@ ALLOWED: dict[str, dict[str, Allowed]] = {
     'controller': _allowed(CONTROLLER),
 }
 REQUIRED = ('mechanism', 'table', 'initial', 'duration', 'seed')
-OPTIONAL = ('plant', 'estimator', 'controller', 'arm_at', 'setpoints')
+OPTIONAL = ('believed', 'plant', 'estimator', 'controller', 'arm_at', 'setpoints')
 
 
 def load_scenario(name: str) -> Scenario:
@@ -201,6 +204,9 @@ def scenario_from(values: Mapping[str, Any], folder: Path) -> Scenario:
     check_keys(values, REQUIRED, 'scenario', ScenarioError, optional=OPTIONAL)
     mechanism_name, table_name = (
         _file_name(kind, values[kind], folder) for kind in ('mechanism', 'table'))
+    believed_name = mechanism_name
+    if 'believed' in values:
+        believed_name = _file_name('believed', values['believed'], folder)
     mechanism = load_mechanism(mechanism_name)
     initial = _section('initial', InitialState, values)
     plant = _section('plant', PlantSettings, values)
@@ -210,7 +216,8 @@ def scenario_from(values: Mapping[str, Any], folder: Path) -> Scenario:
     if arm_at is not None:
         arm_at = float(_checked('arm_at', arm_at, 0.0, (0.0, duration, 's')))
     return Scenario(
-        mechanism_name, mechanism, table_name, load_table(table_name), initial, plant,
+        mechanism_name, mechanism, believed_name, load_mechanism(believed_name), table_name,
+        load_table(table_name), initial, plant,
         _section('estimator', EstimatorSettings, values),
         _section('controller', ControllerSettings, values), arm_at,
         _script(values.get('setpoints', []), start, arm_at, duration, plant.period_ns), duration,

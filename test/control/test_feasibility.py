@@ -40,8 +40,8 @@ from fourbar_ros.mechanism import (
     Mechanism,
     reduced_form,
 )
-from fourbar_ros.plant import InitialState, Plant, Table
 from fourbar_ros.mechanism.motors import available_torque, motors_of
+from fourbar_ros.plant import InitialState, Plant, Table
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelEncoders
 import numpy as np

@@ -35,9 +35,10 @@ from fourbar_ros.errors import FourbarError
 STUDIES = {
     'validation': 'section 3: our motions beside other engines and reference motions',
     'consistency': 'the estimator in closed loops at random: NEES, NIS, errors beside their bound',
+    'crossing': 'change points with four wheels and with two: crossing, parking, turning there',
 }
-RANDOM = frozenset({'consistency'})
-"""Those that draw at random."""
+RANDOM = {'consistency': 100, 'crossing': 300}
+"""Those that draw at random, and how many runs of each kind unless told."""
 
 LARGEST_SEED = 2 ** 63 - 1
 MOST_RUNS = 1_000_000
@@ -110,6 +111,6 @@ def load_study(name: str, **sample: int) -> Callable[[Progress], Result]:
     if sample and name not in RANDOM:
         raise StudyError(f'study {name} draws nothing at random: it takes no '
                          + ', '.join(f'--{option}' for option in sample))
-    drawn = {'sample': Sample(**sample)} if name in RANDOM else {}
+    drawn = {'sample': Sample(**{'runs': RANDOM[name], **sample})} if name in RANDOM else {}
     run: Callable[..., Result] = import_module(f'{__name__}.{name}').run
     return partial(run, **drawn)
