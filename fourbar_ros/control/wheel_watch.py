@@ -311,7 +311,8 @@ def _degraded(j: int, wheel: Array, asked: float, by_speed: bool, speed: float, 
         tardy = abs(wheel[LONG_BEHIND]) > BEHIND
     else:
         tardy = late[0] > max(EXPLAINED_BETTER * best, (VISIBLE * limit) ** 2)
-    rubbing = friction[0] > 0.0 and wheel[FAST_FOR] > AFTER_SLOW and _rubs(wheel, speed, limit, period)
+    rubbing = (friction[0] > 0.0 and wheel[FAST_FOR] > AFTER_SLOW
+               and _rubs(wheel, speed, limit, period))
     looked_at = max(abs(wheel[LONG_EFFORT]), abs(wheel[LONG_EXPECTED])) > LOOKED_AT * limit
     if looked_at and (missing or tardy or rubbing):
         wheel[SUSPECT_FOR] += period

@@ -118,8 +118,8 @@ def go(run: Run) -> Passage:
             assert truth is not None
             angles.append(truth.link_angles)
             torque = max(torque, float(np.abs(truth.efforts).max()))
-    except FourbarError as error:
-        reason = str(error)
+    except FourbarError as failure:
+        reason = str(failure)
     way = np.array(angles)
     eta = wrap_angles(way[:, 2] - way[:, 0])
     goal = np.array([scenario.setpoints[-1].positions] * 2).ravel()
