@@ -13,8 +13,9 @@
 # limitations under the License.
 
 """
-Commands that call one service: `fourbar arm`, `disarm`, `stop`, `reset` of the device, and
-`fourbar enable`, `disable`, `hold`, `damp` of the controller.
+`fourbar arm`, `disarm`, `stop`, `reset`, `enable`, `disable`, `hold`, `damp`: call one service.
+
+The first four are the device's, the others the controller's.
 """
 
 from __future__ import annotations
