@@ -46,6 +46,10 @@ COMMANDS = {
     'disarm': 'stop driving the wheels, they coast',
     'stop': 'emergency stop, latched',
     'reset': 'release the emergency stop',
+    'enable': 'let the controller drive the wheels',
+    'disable': 'keep the controller from driving, the wheels get no torque',
+    'hold': 'come to rest and stay there',
+    'damp': 'stop all rates, wherever that ends',
     'sim': 'pause, resume, step or reset the simulated table',
     'status': 'show device and controller',
     'record': 'write topics to a rosbag2 directory',
@@ -58,7 +62,8 @@ COMMANDS = {
 }
 
 # Commands that share a module; the others have one of their own name.
-MODULES = dict.fromkeys(('arm', 'disarm', 'stop', 'reset'), 'services')
+MODULES = dict.fromkeys(
+    ('arm', 'disarm', 'stop', 'reset', 'enable', 'disable', 'hold', 'damp'), 'services')
 
 USAGE_ERROR = 2
 INTERRUPTED = 130

@@ -26,9 +26,10 @@ from __future__ import annotations
 from math import cos, sin
 
 from fourbar_ros.mechanism.compiled import kernel
-from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.constrained import directions, factored_inertia
 from fourbar_ros.mechanism.dynamics import mass_matrix, reduced_terms_at
+from fourbar_ros.mechanism.forces import Four
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,6 +42,26 @@ NO_HOLD = 0.35
 (A00, A01, A11, BRANCH_A, BRANCH_B, BRANCH_INERTIA, BRANCH_ANGLE, BRANCH_RATE, HOLD,
  CONDITION) = range(10)
 TERMS = 10
+
+
+@kernel
+def pair_terms(angles: Array, rates: Four, constants: Constants
+               ) -> tuple[Array, Four, float, float, float, float, float]:
+    """
+    Evaluate paper eq. 6 on the pairs, a with c and b with d.
+
+    `A = T^T M T` and `b = T^T h`, `M` and `h` those of the four link angles: the axes turn with
+    the pairs, so T is constant.
+
+    :param angles: (4,) of the links [rad].
+    :param rates: of the four links [rad/s].
+    :returns: M (4, 4) [kg m^2], h [N m]; A00, A01, A11 [kg m^2], b0, b1 [N m].
+    """
+    m = mass_matrix(angles, constants)
+    cosines, sines = directions((angles[0], angles[1], angles[2], angles[3]))
+    _, h = factored_inertia(cosines, sines, rates, constants)
+    return (m, h, m[0, 0] + 2.0 * m[0, 2] + m[2, 2], m[0, 1] + m[0, 3] + m[2, 1] + m[2, 3],
+            m[1, 1] + 2.0 * m[1, 3] + m[3, 3], h[0] + h[2], h[1] + h[3])
 
 
 @kernel
@@ -102,17 +123,10 @@ def _parallel_axes(angles: Array, rates: Array, reference_angles: Array, referen
     rows[:] = 0.0
     rows[0, 0] = rows[0, 2] = rows[1, 1] = rows[1, 3] = 1.0
     rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3] = -0.5, -0.5 * gearing, 0.5, 0.5 * gearing
-    matrix = mass_matrix(angles, constants)
-    cosines, sines = directions((angles[0], angles[1], angles[2], angles[3]))
-    _, h = factored_inertia(
-        cosines, sines, (rates[0], rates[1], rates[2], rates[3]), constants)
-    # A = T^T M T and b = T^T h: the axes turn with the pairs, so T is constant.
-    terms[A00] = matrix[0, 0] + 2.0 * matrix[0, 2] + matrix[2, 2]
-    terms[A01] = matrix[0, 1] + matrix[0, 3] + matrix[2, 1] + matrix[2, 3]
-    terms[A11] = matrix[1, 1] + 2.0 * matrix[1, 3] + matrix[3, 3]
+    matrix, h, terms[A00], terms[A01], terms[A11], bias[0], bias[1] = pair_terms(
+        angles, (rates[0], rates[1], rates[2], rates[3]), constants)
+    bias[2] = rows[2, 0] * h[0] + rows[2, 1] * h[1] + rows[2, 2] * h[2] + rows[2, 3] * h[3]
     for row in range(3):
-        bias[row] = (rows[row, 0] * h[0] + rows[row, 1] * h[1] + rows[row, 2] * h[2]
-                     + rows[row, 3] * h[3])
         coupled = 0.0
         for i in range(4):
             for k in range(4):

@@ -30,6 +30,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import ceil, inf
 
+from fourbar_ros.control.axes import pair_terms
 from fourbar_ros.control.reference import SoftStep, Way
 from fourbar_ros.control.setpoint import (
     angles_along,
@@ -39,9 +40,8 @@ from fourbar_ros.control.setpoint import (
 )
 from fourbar_ros.mechanism import ClosureError, FLYWHEEL_NAMES, Mechanism
 from fourbar_ros.mechanism.compiled import kernel
-from fourbar_ros.mechanism.constants import Array, Constants
-from fourbar_ros.mechanism.constrained import directions, factored_inertia
-from fourbar_ros.mechanism.dynamics import mass_matrix, reduced_terms_at
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.dynamics import reduced_terms_at
 import numpy as np
 from numpy.typing import NDArray
 
@@ -285,8 +285,8 @@ def wheel_loads(times: Array, angles: Array, motion: Array, parallel: bool, mobi
     for n in range(count):
         rate_a, rate_b = motion[n, 0, 0], motion[n, 0, 1]
         if parallel:
-            a00, a01, a11, b0, b1 = _parallelogram_terms(
-                angles[n], rate_a, rate_b, constants[0])
+            _, _, a00, a01, a11, b0, b1 = pair_terms(
+                angles[n], (rate_a, rate_b, rate_a, rate_b), constants[0])
             g1, g2, g3, g4 = 1.0, 0.0, 0.0, 1.0
         else:
             a00, a01, a11, b0, b1, g1, g2, g3, g4, _, _ = reduced_terms_at(
@@ -313,18 +313,6 @@ def wheel_loads(times: Array, angles: Array, motion: Array, parallel: bool, mobi
                 torques[n - 1, wheel] + torques[n, wheel]) / inertias[wheel]
             gained[n, wheel] = driven - link_rates[n, wheel] + link_rates[0, wheel]
     return torques, gained, unmet / largest if largest > 0.0 else 0.0
-
-
-@kernel
-def _parallelogram_terms(angles: Array, rate_a: float, rate_b: float, constants: Constants
-                         ) -> tuple[float, float, float, float, float]:
-    """Evaluate A00, A01, A11, b0, b1 with omega_c = omega_a and omega_d = omega_b."""
-    m = mass_matrix(angles, constants)
-    cosines, sines = directions((angles[0], angles[1], angles[2], angles[3]))
-    _, (h_a, h_b, h_c, h_d) = factored_inertia(
-        cosines, sines, (rate_a, rate_b, rate_a, rate_b), constants)
-    return (m[0, 0] + 2.0 * m[0, 2] + m[2, 2], m[0, 1] + m[0, 3] + m[2, 1] + m[2, 3],
-            m[1, 1] + 2.0 * m[1, 3] + m[3, 3], h_a + h_c, h_b + h_d)
 
 
 @kernel

@@ -198,16 +198,21 @@ def scenario_from(values: Mapping[str, Any], folder: Path) -> Scenario:
     """
     Make a scenario from the keys of a scenario file.
 
-    :param folder: where relative paths of mechanism and table begin.
+    :param folder: where relative paths of mechanisms and table begin.
     :raises FourbarError: a key is missing or unknown, or a value is refused.
     """
     check_keys(values, REQUIRED, 'scenario', ScenarioError, optional=OPTIONAL)
     mechanism_name, table_name = (
         _file_name(kind, values[kind], folder) for kind in ('mechanism', 'table'))
-    believed_name = mechanism_name
+    mechanism = load_mechanism(mechanism_name)
+    believed_name, believed = mechanism_name, mechanism
     if 'believed' in values:
         believed_name = _file_name('believed', values['believed'], folder)
-    mechanism = load_mechanism(mechanism_name)
+        try:
+            believed = load_mechanism(believed_name)
+        except FourbarError as error:
+            # There are two of its kind: say which.
+            raise ScenarioError(f'believed: {error}') from None
     initial = _section('initial', InitialState, values)
     plant = _section('plant', PlantSettings, values)
     start = assemble(mechanism, initial.link_a, initial.link_b, initial.branch)
@@ -216,7 +221,7 @@ def scenario_from(values: Mapping[str, Any], folder: Path) -> Scenario:
     if arm_at is not None:
         arm_at = float(_checked('arm_at', arm_at, 0.0, (0.0, duration, 's')))
     return Scenario(
-        mechanism_name, mechanism, believed_name, load_mechanism(believed_name), table_name,
+        mechanism_name, mechanism, believed_name, believed, table_name,
         load_table(table_name), initial, plant,
         _section('estimator', EstimatorSettings, values),
         _section('controller', ControllerSettings, values), arm_at,

@@ -122,30 +122,31 @@ class TestbedClient:
                 self.node.get_subscriptions_info_by_topic(self.node.resolve_topic_name(topic)))
             for topic in topics)
 
-    def call(self, kind, service, request, patience=PATIENCE):
+    def call(self, kind, service, request, patience=PATIENCE, of='device'):
         """
-        Call one of the device's services, again if no answer comes and that does no harm.
+        Call a service, again if no answer comes and that does no harm.
 
         :param kind: its type.
+        :param of: who offers it, to say who is missing.
         :returns: success and message of the response.
         :raises RosError: nobody offers it, or nobody answers.
         """
         client = self.node.create_client(kind, service)
         name = self.node.resolve_service_name(service)
         self.wait(client.service_is_ready, patience,
-                  f'no device found: service {name} did not appear')
+                  f'no {of} found: service {name} did not appear')
         question = Question(client, service, request)
         self.wait(question.answered, patience, f'no answer from service {name}')
         self.node.destroy_client(client)
         return question.response.success, question.response.message
 
-    def switch(self, service, wanted):
+    def switch(self, service, wanted, of='device'):
         """Call a service that takes yes or no, `arm` or `sim/pause`: success and message."""
-        return self.call(SetBool, service, SetBool.Request(data=wanted))
+        return self.call(SetBool, service, SetBool.Request(data=wanted), of=of)
 
-    def trigger(self, service):
+    def trigger(self, service, of='device'):
         """Call a service without arguments: success and message."""
-        return self.call(Trigger, service, Trigger.Request())
+        return self.call(Trigger, service, Trigger.Request(), of=of)
 
     def offer_setpoints(self):
         """Become a publisher of setpoints, so that others can find it before the first one."""

@@ -21,9 +21,13 @@ import time
 ASK_AGAIN = 1.0
 
 # Services which, asked twice, leave the device as they do asked once, whatever others ask in
-# between. `sim/step` is none, and to arm or to release a stop is none, either: somebody else may
-# have disarmed or stopped meanwhile.
-REPEATABLE = frozenset({'emergency_stop', 'estimate/reset', 'sim/pause', 'sim/reset'})
+# between. `sim/step` is none, and to arm, to enable or to release a stop is none, either: somebody
+# else may have disarmed or stopped meanwhile.
+REPEATABLE = frozenset(
+    {'damp', 'emergency_stop', 'estimate/reset', 'hold', 'sim/pause', 'sim/reset'})
+
+# Likewise, if they are asked for no.
+REPEATABLE_NO = frozenset({'arm', 'enable'})
 
 # What is asked once is asked so much later, when the server knows who asks [s].
 ACQUAINTED_AFTER = 0.2
@@ -44,7 +48,7 @@ class Question:
     def __init__(self, client, service, request):
         self._client = client
         self._request = request
-        again = service in REPEATABLE or service == 'arm' and not request.data
+        again = service in REPEATABLE or service in REPEATABLE_NO and not request.data
         self._interval = ASK_AGAIN if again else inf
         self._due = time.monotonic() + (0.0 if again else ACQUAINTED_AFTER)
         self._asked = []

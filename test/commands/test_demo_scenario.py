@@ -40,6 +40,19 @@ def test_nodes_get_the_scenario_with_the_duration_of_its_setpoint(
     assert written == wanted
 
 
+def test_estimator_and_controller_get_the_believed_mechanism(tmp_path: Path) -> None:
+    content = yaml.safe_load((share_directory() / 'config' / 'scenario_paper.yaml').read_text())
+    heavy = (share_directory() / 'config' / 'mechanism_paper.yaml').read_text().replace(
+        '3.4e-7', '4.0e-7')
+    (tmp_path / 'heavy.yaml').write_text(heavy)
+    (tmp_path / 'mine.yaml').write_text(yaml.safe_dump({**content, 'believed': './heavy.yaml'}))
+    _write_parameters(_one_move(str(tmp_path / 'mine.yaml')), tmp_path / 'parameters.yaml')
+    written = yaml.safe_load((tmp_path / 'parameters.yaml').read_text())
+    assert {key: section['ros__parameters']['mechanism'] for key, section in written.items()} == {
+        '/**/plant': 'paper', '/**/estimator': str(tmp_path / 'heavy.yaml'),
+        '/**/controller': str(tmp_path / 'heavy.yaml')}
+
+
 @pytest.mark.parametrize(('preset', 'told'), [
     ('papre', 'available are paper, prototype'), ('./none.yaml', 'no such file'),
     ('./twice.yaml', 'this scenario has 2 setpoints'),

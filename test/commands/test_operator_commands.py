@@ -12,12 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""`fourbar arm`, `disarm`, `stop`, `reset`, `status`, `setpoint` as they are typed."""
+"""The commands of an operator as they are typed: to device and controller, and `status`."""
 
 from importlib.util import module_from_spec, spec_from_file_location
 from math import radians
 from pathlib import Path
 
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 import pytest
 from std_srvs.srv import SetBool, Trigger
 
@@ -34,6 +35,10 @@ suite, nursery = harness.suite, harness.nursery
 
 COMMANDS = {'arm': [], 'disarm': [], 'stop': [], 'reset': [], 'status': [],
             'setpoint': ['link_a=0']}
+OF_CONTROLLER = ('enable', 'disable', 'hold', 'damp')
+# What a controller says of itself when a wheel is lost.
+TROUBLED = {'mode': 'hold', 'problem': 'axis b is lost: flywheel_b, flywheel_d cannot be used',
+            'wheel_faults': 'flywheel_b: dead, flywheel_d: dead'}
 
 
 @pytest.fixture(scope='module')
@@ -71,7 +76,7 @@ def armed(testbed):
 
 class Lossy:
     """
-    A service of the device that obeys every request, and whose first answer gets lost.
+    A service that obeys every request, and whose first answer gets lost.
 
     :ivar asked: how often it was asked.
     """
@@ -94,19 +99,29 @@ class Lossy:
 @pytest.fixture(scope='module')
 def unanswered(module_suite, make_probe):
     """
-    Run commands, all at once, that get no answer or not the first one.
+    Run commands, all at once, that get no answer or not the first one, and `status` there.
 
     :returns: exit code, stdout and stderr by namespace and name; and how often the services
         of /lossy were asked, by their names.
     """
     there = make_probe('/lossy')
     services = {'arm': Lossy(there.node, SetBool, 'arm'),
+                'enable': Lossy(there.node, SetBool, 'enable'),
+                'damp': Lossy(there.node, Trigger, 'damp'),
                 'reset_emergency_stop': Lossy(there.node, Trigger, 'reset_emergency_stop'),
                 'sim/step': Lossy(there.node, Trigger, 'sim/step')}
+    statuses = {name: there.node.create_publisher(
+        DiagnosticStatus, f'/lossy/{name}_status', harness.LATCHED)
+        for name in ('device', 'controller')}
+    for name, values in (('device', {'state': 'armed'}), ('controller', TROUBLED)):
+        statuses[name].publish(DiagnosticStatus(
+            values=[KeyValue(key=key, value=value) for key, value in values.items()]))
     started = {(namespace, name): module_suite.start(
         name, *arguments, '--ros-args', '-r', f'__ns:={namespace}')
         for namespace, name, arguments in (
-            ('/lossy', 'disarm', []), ('/lossy', 'reset', []), ('/lossy', 'sim', ['step']),
+            ('/lossy', 'disarm', []), ('/lossy', 'disable', []), ('/lossy', 'damp', []),
+            ('/lossy', 'reset', []), ('/lossy', 'sim', ['step']), ('/lossy', 'status', []),
+            *(('/nobody', name, []) for name in OF_CONTROLLER),
             *(('/nobody', name, arguments) for name, arguments in COMMANDS.items()))}
     for process in started.values():
         there.wait(lambda popen=process.popen: popen.poll() is not None)
@@ -127,12 +142,21 @@ def test_nobody_there_is_said_in_one_line(unanswered, name):
     assert line.startswith(f'fourbar {name}: no device found')
 
 
-def test_lost_answer_is_asked_for_again(unanswered):
+@pytest.mark.parametrize('name', OF_CONTROLLER)
+def test_no_controller_there_is_said_in_one_line(unanswered, name):
+    assert unanswered[0]['/nobody', name] == (
+        1, '', f'fourbar {name}: no controller found: service /nobody/'
+        f'{"enable" if name == "disable" else name} did not appear within 5 s\n')
+
+
+@pytest.mark.parametrize(('name', 'service'), [
+    ('disarm', 'arm'), ('disable', 'enable'), ('damp', 'damp')])
+def test_lost_answer_is_asked_for_again(unanswered, name, service):
     results, asked = unanswered
-    code, out, err = results['/lossy', 'disarm']
+    code, out, err = results['/lossy', name]
     assert (code, out.split()[0], err) == (0, 'obeyed', '')
     # As often as it was asked until then: the second time, or later on a busy machine.
-    assert 2 <= int(out.split()[1]) <= asked['arm']
+    assert 2 <= int(out.split()[1]) <= asked[service]
 
 
 @pytest.mark.parametrize(('name', 'service'), [
@@ -174,6 +198,47 @@ def test_status_tells_both(armed, fourbar):
     assert values['mode'] == 'hold'
     lines = out.splitlines()
     assert lines.index('device') < lines.index('controller')
+
+
+def test_status_tells_what_is_wrong(unanswered):
+    code, out, err = unanswered[0]['/lossy', 'status']
+    assert (code, err) == (0, '')
+    told = [line.split(maxsplit=1) for line in out.splitlines()]
+    for key, value in TROUBLED.items():
+        assert [key, value] in told
+
+
+def test_status_has_a_line_for_what_may_go_wrong(armed, fourbar):
+    told = [line.split() for line in fourbar('status')[1].splitlines()]
+    assert ['mode', 'hold'] in told
+    # Nothing is.
+    assert ['problem'] in told
+    assert ['wheel_faults'] in told
+
+
+def test_hold_ends_a_move_and_damp_keeps_no_place(armed, fourbar):
+    assert fourbar('setpoint', 'link_b=70deg') == (0, 'accepted\n', '')
+    assert fourbar('hold') == (0, 'holds\n', '')
+    assert armed.status('controller_status', goal='')['mode'] == 'hold'
+    assert fourbar('damp') == (0, 'stops all rates\n', '')
+    armed.status('controller_status', mode='damp')
+    assert fourbar('hold') == (0, 'holds\n', '')
+    armed.status('controller_status', mode='hold')
+
+
+def test_disable_takes_the_wheels_from_the_controller_until_enable(armed, fourbar):
+    assert fourbar('disable') == (0, 'not enabled: the wheels get no torque\n', '')
+    armed.status('controller_status', mode='idle')
+    assert list(armed.more('flywheel_command')[0].effort) == [0.0] * 4
+    assert fourbar('hold') == (1, '', 'the controller is not enabled\n')
+    assert fourbar('enable') == (0, 'enabled\n', '')
+    armed.status('controller_status', mode='hold')
+    armed.status('device_status', state='armed')
+
+
+@pytest.mark.parametrize('name', ['hold', 'damp'])
+def test_what_only_an_armed_device_can_do_is_refused(testbed, fourbar, name):
+    assert fourbar(name) == (1, '', 'the device is not armed\n')
 
 
 def test_setpoint_in_degrees_is_accepted(armed, fourbar):

@@ -293,6 +293,28 @@ def test_closed_loop_table_is_the_recorded_run(tmp_path: Path) -> None:
     assert output.read_text() == ''.join(record_run(scenario).lines())
 
 
+def test_closed_loop_moves_the_mechanism_by_torques_for_the_believed_one(tmp_path: Path) -> None:
+    """Nothing of the table changes until the first torque, which comes after arm_at."""
+    config = share_directory() / 'config'
+    text = (config / 'scenario_paper.yaml').read_text()
+    (tmp_path / 'heavy.yaml').write_text(
+        (config / 'mechanism_paper.yaml').read_text().replace('2.2e-5', '4.4e-5'))
+    tables = {}
+    for name in ('paper', './heavy.yaml'):
+        (tmp_path / 'mine.yaml').write_text(f'{text}\nbelieved: {name}\n')
+        output = tmp_path / 'out.csv'
+        assert main(['simulate', '--closed-loop', str(tmp_path / 'mine.yaml'), '--duration',
+                     '0.6', '-o', str(output)]) == 0
+        header, *lines = output.read_text().splitlines()
+        columns = [place for place, column in enumerate(header.split(','))
+                   if column == 't' or column.startswith(('true_', 'measured_'))]
+        tables[name] = [[line.split(',')[place] for place in columns] for line in lines]
+    same = [one == other for one, other in zip(tables['paper'], tables['./heavy.yaml'])]
+    armed = round(0.3 * 250.0)
+    assert all(same[:armed + 1])
+    assert not any(same[armed + 2:])
+
+
 @pytest.mark.parametrize(('arguments', 'told'), [
     ([], 'either CASE.json or --closed-loop'),
     (['case.json', '--closed-loop', 'paper'], 'either CASE.json or --closed-loop'),

@@ -131,6 +131,32 @@ def test_relative_paths_begin_at_the_file(
     assert scenario.mechanism.link_lengths[0] == 0.3
 
 
+@pytest.mark.parametrize('name', ['paper', 'prototype'])
+def test_believed_is_the_mechanism_unless_told(name: str) -> None:
+    scenario = load_scenario(name)
+    assert scenario.believed_name == scenario.mechanism_name == name
+    assert scenario.believed is scenario.mechanism
+
+
+def test_believed_may_be_another_preset_or_a_path_from_the_file(
+    written: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / 'heavy.yaml').write_text(heavier_wheels())
+    monkeypatch.chdir('/')
+    scenario = load_scenario(written({**GOOD, 'believed': './heavy.yaml'}))
+    assert scenario.mechanism_name == 'paper'
+    assert scenario.believed_name == str(tmp_path / 'heavy.yaml')
+    assert scenario.mechanism.flywheel_inertias.tolist() == [3.4e-7] * 4
+    assert scenario.believed.flywheel_inertias.tolist() == [4e-7] * 4
+    assert load_scenario(written({**GOOD, 'believed': 'prototype'})).believed_name == 'prototype'
+
+
+def heavier_wheels() -> str:
+    """Return the paper's mechanism with wheels of 4e-7 kg m^2."""
+    text = (share_directory() / 'config' / 'mechanism_paper.yaml').read_text()
+    return text.replace('3.4e-7', '4.0e-7')
+
+
 # What the nodes get
 
 def checked(parameters: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -156,6 +182,17 @@ def test_parameters_say_what_the_file_says(written: Write) -> None:
     assert parameters['estimator']['counts_per_turn'] == 0
     assert parameters['controller']['damping'] == 1.0
     assert {values['mechanism'] for values in parameters.values()} == {'paper'}
+
+
+def test_plant_has_the_mechanism_and_the_others_the_believed_one(
+    written: Write, tmp_path: Path,
+) -> None:
+    (tmp_path / 'heavy.yaml').write_text(heavier_wheels())
+    parameters = load_scenario(written({**GOOD, 'believed': './heavy.yaml'})).parameters()
+    assert {node: values['mechanism'] for node, values in parameters.items()} == {
+        'plant': 'paper', 'estimator': str(tmp_path / 'heavy.yaml'),
+        'controller': str(tmp_path / 'heavy.yaml')}
+    assert checked(parameters) == parameters
 
 
 def test_what_is_left_out_and_what_is_allowed_is_as_in_the_nodes(written: Write) -> None:
@@ -236,6 +273,9 @@ def test_number_that_is_none_or_out_of_range(place: str, value: Any, written: Wr
     ('initial', [], 'initial must be a section'),
     ('mechanism', 'papre', "no mechanism 'papre'"),
     ('mechanism', 3, 'mechanism must be the name'),
+    ('believed', 'papre', "believed: no mechanism 'papre'"),
+    ('believed', './none.yaml', 'none.yaml: no such file'),
+    ('believed', 3, 'believed must be the name'),
     ('table', './none.yaml', 'none.yaml: no such file'),
     ('setpoints', 3, 'setpoints must be a list'),
     ('setpoints', {}, 'setpoints must be a list'),
@@ -260,6 +300,18 @@ def test_loop_that_cannot_close_at_the_start(written: Write, tmp_path: Path) -> 
             'link_lengths: [0.1, 0.1, 0.1, 0.1]', 'link_lengths: [0.3, 0.3, 0.1, 0.1]'))
     content = {**GOOD, 'mechanism': './m.yaml', 'initial': {'link_a': 0.0, 'link_b': 3.0}}
     assert 'cannot close' in refused(written(content))
+
+
+@pytest.mark.parametrize(('old', 'new', 'told'), [
+    ('4.0e-7', '-4.0e-7', 'flywheel_inertias'), ('link_masses:', 'masses:', 'link_masses missing'),
+    (']', '', 'line 7')])
+def test_believed_mechanism_that_is_broken(
+    old: str, new: str, told: str, written: Write, tmp_path: Path,
+) -> None:
+    (tmp_path / 'heavy.yaml').write_text(heavier_wheels().replace(old, new))
+    message = refused(written({**GOOD, 'believed': './heavy.yaml'}))
+    assert f'believed: {tmp_path / "heavy.yaml"}' in message
+    assert told in message
 
 
 @pytest.mark.parametrize('text', ['', '- 1', 'a: [', 'seed: 1\nseed: 2\n'])
