@@ -137,7 +137,8 @@ class SimulatedTable:
         while done < steps:
             until = self._next_pause(done, steps)
             part = values if values.ndim == 1 else values[done:until]
-            self._plant.advance(until - done, part, by_speed, self._conditions)
+            self._plant.advance(
+                until - done, part, by_speed, conditions=self._conditions)
             efforts += self._plant.efforts * ((until - done) / steps)
             done = until
             if done < steps:

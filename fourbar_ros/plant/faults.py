@@ -72,8 +72,10 @@ WHEEL_FAULTS = {
     'stuck': FaultKind('a brake holds the wheel to its link', 'torque', 'N m', 0.1, 0.0, 10.0),
     'weak': FaultKind('the motor gives a part of its torque', 'part', '', 0.5, 0.0, 1.0),
     'dragging': FaultKind('more friction in the bearing', 'torque', 'N m', 1e-4, 0.0, 10.0),
-    'runaway': FaultKind('the motor gives this torque, as far as it can, whatever it is told',
-                         'torque', 'N m', 10.0, -10.0, 10.0),
+    'runaway': FaultKind('while powered the motor gives this torque, as far as it can, whatever '
+                         'it is told', 'torque', 'N m', 10.0, -10.0, 10.0),
+    'shorted': FaultKind('the power stage gives this torque, as far as the motor can, and cannot '
+                         'be cut', 'torque', 'N m', 10.0, -10.0, 10.0),
     'delayed': FaultKind('the motor follows its commands later', 'delay', 's', 0.05, 0.0, 1.0),
 }
 """Faults of a flywheel drive."""
@@ -156,8 +158,9 @@ class WheelFaults:
 
     :param torque_scale: (4,) of the motor torque, 1 in health.
     :param extra_friction: (4,) Coulomb friction beyond that of the bearing [N m].
-    :param forced_torque: (4,) torque of the motor whatever the command is [N m], NaN in health.
-        It is not cut to what the motor can give.
+    :param forced_torque: (4,) torque of a powered motor whatever the command is [N m], NaN in
+        health. It is not cut to what the motor can give.
+    :param shorted_torque: (4,) likewise, powered or not.
     :param hold_torque: (4,) greatest torque of a brake between wheel and link [N m].
     :param command_delay_s: (4,) [s].
     """
@@ -165,6 +168,7 @@ class WheelFaults:
     torque_scale: Array
     extra_friction: Array
     forced_torque: Array
+    shorted_torque: Array
     hold_torque: Array
     command_delay_s: Array
 
@@ -175,10 +179,11 @@ def wheel_faults(faults: Iterable[Fault]) -> WheelFaults:
 
     :param faults: at most one for each target; those of sensors change nothing here.
     """
-    made = WheelFaults(np.ones(4), np.zeros(4), np.full(4, nan), np.zeros(4), np.zeros(4))
+    made = WheelFaults(np.ones(4), np.zeros(4), np.full(4, nan), np.full(4, nan), np.zeros(4),
+                       np.zeros(4))
     acts_on = {'dead': made.torque_scale, 'weak': made.torque_scale, 'stuck': made.hold_torque,
                'dragging': made.extra_friction, 'runaway': made.forced_torque,
-               'delayed': made.command_delay_s}
+               'shorted': made.shorted_torque, 'delayed': made.command_delay_s}
     for fault in faults:
         if fault.target in FLYWHEEL_NAMES:
             wheel = FLYWHEEL_NAMES.index(fault.target)

@@ -22,7 +22,7 @@ and work of every torque are exact, and only friction in joints and drag need a 
 
 from __future__ import annotations
 
-from math import cos, isfinite, isnan, sin
+from math import cos, isfinite, isnan, nan, sin
 from typing import Any
 
 from fourbar_ros.mechanism.compiled import kernel
@@ -59,7 +59,8 @@ from numpy.typing import NDArray
 
 FIELDS: list[tuple[str, type, tuple[int, ...]]] = [
     ('scale', float, (4,)),             # of the torque that is asked for
-    ('forced', float, (4,)),            # N m, whatever is asked for; NaN for none
+    ('forced', float, (4,)),            # N m, whatever a powered motor is asked for; NaN for none
+    ('shorted', float, (4,)),           # N m, powered or not; NaN for none
     ('extra_coulomb', float, (4,)),     # N m
 ]
 
@@ -69,7 +70,7 @@ WheelConditions = np.record
 Boxed = NDArray[Any]
 """An array of one record: a record by itself takes longer to hand to a kernel than it runs."""
 
-SOUND = np.array([record(FIELDS, scale=1.0, forced=np.nan, extra_coulomb=0.0)])
+SOUND = np.array([record(FIELDS, scale=1.0, forced=nan, shorted=nan, extra_coulomb=0.0)])
 """The conditions, boxed, where nothing is wrong."""
 
 
@@ -77,7 +78,7 @@ def conditions_of(faults: WheelFaults) -> Boxed:
     """Turn faults of the wheels into what the kernels take; their delays act elsewhere."""
     return np.array([record(
         FIELDS, scale=faults.torque_scale, forced=faults.forced_torque,
-        extra_coulomb=faults.extra_friction + faults.hold_torque)])
+        shorted=faults.shorted_torque, extra_coulomb=faults.extra_friction + faults.hold_torque)])
 
 
 # The state of a motor: its torque now [N m], and what its speed loop has learnt [N m].
@@ -86,9 +87,10 @@ MOTOR_STATE_SIZE = 8
 
 @kernel
 def advance_plant(
-    state: Array, motor_state: Array, commands: Array, by_speed: NDArray[np.bool_], step: float,
-    boxed_constants: Boxed, boxed_around: Boxed, boxed_motors: Boxed, boxed_conditions: Boxed,
-    half_sizes: Array, restitution: float, efforts: Array, added: Array,
+    state: Array, motor_state: Array, commands: Array, by_speed: NDArray[np.bool_],
+    powered: NDArray[np.bool_], step: float, boxed_constants: Boxed, boxed_around: Boxed,
+    boxed_motors: Boxed, boxed_conditions: Boxed, half_sizes: Array, restitution: float,
+    efforts: Array, added: Array,
 ) -> None:
     """
     Advance the plant by as many steps as there are commands, in place.
@@ -97,6 +99,7 @@ def advance_plant(
     :param motor_state: (8,).
     :param commands: (n, 4) torques [N m], or speeds relative to the links [rad/s].
     :param by_speed: (4,) bool, which of both for each wheel.
+    :param powered: (4,) bool, whose power stage is on.
     :param half_sizes: (2,) from the middle of the table to its edges [m].
     :param restitution: of the edge.
     :param efforts: (4,) receives the mean torque of the motors [N m].
@@ -108,14 +111,17 @@ def advance_plant(
     given, torques, recoil = np.empty(4), np.empty(4), np.zeros(STATE_SIZE)
     before, lever = np.empty(10), np.empty((4, 2))
     efforts[:] = 0.0
+    for j in range(4):
+        if not (by_speed[j] and powered[j]):
+            motor_state[4 + j] = nan    # its speed loop starts anew, whenever that is
     lost = _losses(state, constants, around)
     bounded = isfinite(half_sizes[0]) or isfinite(half_sizes[1])
     for n in range(steps):
         rubbing = False
         for j in range(4):
             given[j] = _motor_torque(
-                j, commands[n, j], by_speed[j], state[12 + j] - state[4 + j], motor_state, step,
-                motors, conditions)
+                j, commands[n, j], by_speed[j], powered[j], state[12 + j] - state[4 + j],
+                motor_state, step, motors, conditions)
             efforts[j] += given[j] / steps
             friction = friction_over_step(
                 j, state[12 + j] - state[4 + j], given[j], 0.0, conditions.extra_coulomb[j],
@@ -154,10 +160,13 @@ def advance_plant(
 
 
 @kernel
-def _motor_torque(wheel: int, command: float, by_speed: bool, speed: float, motor_state: Array,
-                  step: float, motors: Motors, conditions: WheelConditions) -> float:
+def _motor_torque(wheel: int, command: float, by_speed: bool, powered: bool, speed: float,
+                  motor_state: Array, step: float, motors: Motors,
+                  conditions: WheelConditions) -> float:
     """Return the mean torque that a motor gives over a step [N m]."""
-    asked = conditions.forced[wheel]
+    asked = conditions.forced[wheel] if powered else 0.0
+    if not isnan(conditions.shorted[wheel]):
+        asked = conditions.shorted[wheel]
     if isnan(asked):
         asked = command
         if by_speed:

@@ -162,7 +162,8 @@ class Plant:
         self.reset(initial)
         self._check_friction()
         # Compile the kernels now, not while time runs.
-        self._advance(np.zeros((1, 4)), np.zeros(4, dtype=bool), SOUND)
+        none = np.zeros(4, dtype=bool)
+        self._advance(np.zeros((1, 4)), none, none, SOUND)
         self.reset(initial)
 
     def _check_friction(self) -> None:
@@ -245,31 +246,33 @@ class Plant:
             self._around['link_torques'][0] = torques
 
     def advance(self, steps: int, commands: Array, by_speed: ArrayLike = False,
-                conditions: Boxed = SOUND) -> None:
+                powered: ArrayLike = True, conditions: Boxed = SOUND) -> None:
         """
         Move on by a number of steps.
 
         :param commands: (4,) torques asked of the motors [N m], or speeds of the wheels relative
             to the links [rad/s]; or (steps, 4) of them, one for each step.
         :param by_speed: which of both, (4,) or the same for all wheels.
+        :param powered: whose power stage is on, likewise. A motor without power is asked for no
+            torque, and its speed loop forgets.
         :param conditions: what is wrong with the wheels.
         :raises PlantError: the state is no longer finite.
         """
-        followed = np.zeros(4, dtype=bool)
+        followed, live = np.empty(4, dtype=bool), np.empty(4, dtype=bool)
         followed[:] = by_speed
-        self._motor_state[4:][~followed] = np.nan
+        live[:] = powered
         held = np.empty((steps, 4))
         held[:] = commands
-        self._advance(held, followed, conditions)
+        self._advance(held, followed, live, conditions)
         if not np.isfinite(self._state).all():
             raise PlantError('the state of the plant is no longer finite')
 
     def _advance(self, commands: Array, by_speed: NDArray[np.bool_],
-                 conditions: Boxed) -> None:
+                 powered: NDArray[np.bool_], conditions: Boxed) -> None:
         surface = self._table.surface
         advance_plant(
-            self._state, self._motor_state, commands, by_speed, self.step_s, self._constants,
-            self._around, self._motors, conditions,
+            self._state, self._motor_state, commands, by_speed, powered, self.step_s,
+            self._constants, self._around, self._motors, conditions,
             self._half_sizes, float(surface.restitution), self.efforts, self._added)
 
     def truth(self, efforts: Array | None = None) -> Truth:

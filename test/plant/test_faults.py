@@ -40,18 +40,20 @@ WITH_VALUE = [(target, kind) for target in ('link_b', 'joint_3', 'flywheel_d')
               for kind, what in fault_kinds(target).items() if what.quantity]
 WITHOUT_VALUE = [(target, kind) for target in ('link_b', 'joint_3', 'flywheel_d')
                  for kind, what in fault_kinds(target).items() if not what.quantity]
-ARRAYS = ('torque_scale', 'extra_friction', 'forced_torque', 'hold_torque', 'command_delay_s')
+ARRAYS = ('torque_scale', 'extra_friction', 'forced_torque', 'shorted_torque', 'hold_torque',
+          'command_delay_s')
 
 
 def as_numbers(faults: WheelFaults) -> np.ndarray:
-    """Return all five arrays (5, 4), NaN written as 99."""
+    """Return all six arrays (6, 4), NaN written as 99."""
     return np.nan_to_num(np.array([getattr(faults, name) for name in ARRAYS]), nan=99.0)
 
 
 def test_the_faults_promised_are_there() -> None:
     assert set(SENSOR_FAULTS) == {
         'off', 'stuck', 'garbage', 'wrong', 'slow', 'delayed', 'intermittent'}
-    assert set(WHEEL_FAULTS) == {'dead', 'stuck', 'weak', 'dragging', 'runaway', 'delayed'}
+    assert set(WHEEL_FAULTS) == {
+        'dead', 'stuck', 'weak', 'dragging', 'runaway', 'shorted', 'delayed'}
     assert {target for target, _ in ALL} == {*LINK_NAMES, *JOINT_NAMES, *FLYWHEEL_NAMES}
 
 
@@ -151,6 +153,8 @@ def test_a_fault_cannot_be_made_invalid_later() -> None:
     ('dragging 2e-4', 'extra_friction', 2e-4),
     ('runaway -0.02', 'forced_torque', -0.02),
     ('runaway 0', 'forced_torque', 0.0),
+    ('shorted 0.03', 'shorted_torque', 0.03),
+    ('shorted 0', 'shorted_torque', 0.0),
     ('stuck 0.07', 'hold_torque', 0.07),
     ('delayed 0.04', 'command_delay_s', 0.04),
 ])
@@ -168,6 +172,7 @@ def test_a_fault_changes_one_number_of_one_wheel(
 def test_healthy_wheels_do_what_they_are_told() -> None:
     assert HEALTHY_WHEELS.torque_scale.tolist() == [1.0] * 4
     assert np.isnan(HEALTHY_WHEELS.forced_torque).all()
+    assert np.isnan(HEALTHY_WHEELS.shorted_torque).all()
     for name in ('extra_friction', 'hold_torque', 'command_delay_s'):
         assert not getattr(HEALTHY_WHEELS, name).any()
 
