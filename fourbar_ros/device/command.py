@@ -28,7 +28,7 @@ def drive_by_name(names: Sequence[str], positions: Sequence[float],
     """
     Turn a command by wheel names into a drive.
 
-    :param names: wheels in any order; one that is not named gets no torque.
+    :param names: wheels in any order, which are powered; one that is not named is not.
     :param positions: must be empty.
     :param velocities: speed relative to the link for each name [rad/s], or
     :param efforts: torque for each name [N m]: one of both, the other must be empty.
@@ -42,4 +42,5 @@ def drive_by_name(names: Sequence[str], positions: Sequence[float],
     for wheel, value in values_by_name(names, given, FLYWHEEL_NAMES, field).items():
         drive.values[wheel] = value
         drive.by_speed[wheel] = field == 'velocity'
+        drive.powered[wheel] = True
     return drive

@@ -33,15 +33,18 @@ class Drive:
 
     :param values: (4,) torque [N m], or speed of the wheel relative to its link [rad/s].
     :param by_speed: (4,) bool, which of both; speeds are followed by the motors' own electronics.
+    :param powered: (4,) bool, whose power stage is on; a wheel without power coasts, whatever its
+        value.
     """
 
     values: Array
     by_speed: NDArray[np.bool_]
+    powered: NDArray[np.bool_]
 
 
 def no_torque() -> Drive:
-    """Let all wheels coast."""
-    return Drive(np.zeros(4), np.zeros(4, dtype=bool))
+    """Let all wheels coast, without power."""
+    return Drive(np.zeros(4), np.zeros(4, dtype=bool), np.zeros(4, dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)

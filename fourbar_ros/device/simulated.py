@@ -138,7 +138,7 @@ class SimulatedTable:
             until = self._next_pause(done, steps)
             part = values if values.ndim == 1 else values[done:until]
             self._plant.advance(
-                until - done, part, by_speed, conditions=self._conditions)
+                until - done, part, by_speed, drive.powered, self._conditions)
             efforts += self._plant.efforts * ((until - done) / steps)
             done = until
             if done < steps:
@@ -154,7 +154,11 @@ class SimulatedTable:
         return min(steps, max(done + 1, -((self._stamp_ns - due_ns) // self._step_ns)))
 
     def _commands(self, steps: int, drive: Drive) -> tuple[Array, Any]:
-        """Return what the motors act on: the drive, or what was asked for some time ago."""
+        """
+        Return what the motors act on: the drive, or what was asked for some time ago.
+
+        Power is no command: it is switched at once, whatever the delay.
+        """
         self._asked.appendleft((self._steps, drive))
         while len(self._asked) > 1 and self._asked[-2][0] <= self._steps - self._longest_delay:
             self._asked.pop()

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.device.gate import ArmingGate
@@ -47,7 +47,7 @@ class TestbedSettings:
 
     :param command_timeout_s: longest time without a command while armed [s].
     :param sensor_timeout_s: a link sensor without a sample for so long is silent [s].
-    :param timeout_action: what the wheels do when commands stay away: `coast` (no torque),
+    :param timeout_action: what the wheels do when commands stay away: `coast` (no power),
         `hold_speed` or `brake` (to rest relative to the link, which turns the links).
     """
 
@@ -146,6 +146,8 @@ class Testbed:
         """
         Take a wheel command, to act from the last tick on.
 
+        While armed it powers the wheels that it names, and no others.
+
         :param stamp_ns: the tick that it answers [ns].
         :raises RejectedError: it is rejected whole; also counted.
         """
@@ -168,7 +170,7 @@ class Testbed:
         self._command_stamp_ns = stamp_ns
         self._command_steady_ns = steady_ns
         self._answered(stamp_ns, steady_ns)
-        self._drive = Drive(limited, drive.by_speed)
+        self._drive = replace(drive, values=limited)
 
     def arm(self, steady_ns: int, obstacles: Sequence[str]) -> tuple[bool, str]:
         """
@@ -192,12 +194,12 @@ class Testbed:
         return armed, message
 
     def disarm(self, reason: str) -> None:
-        """Stop driving: the wheels coast."""
+        """Stop driving: the wheels coast, without power."""
         self._parked = None
         self.gate.disarm(self._now_ns, reason)
 
     def emergency_stop(self, reason: str) -> None:
-        """Stop driving until reset: the wheels coast."""
+        """Stop driving until reset: the wheels coast, without power."""
         self._parked = None
         self.gate.emergency_stop(self._now_ns, reason)
 
@@ -274,4 +276,4 @@ class Testbed:
 
 
 def _at_speeds(speeds: Array) -> Drive:
-    return Drive(speeds.copy(), np.ones(4, dtype=bool))
+    return Drive(speeds.copy(), np.ones(4, dtype=bool), np.ones(4, dtype=bool))

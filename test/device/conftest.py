@@ -42,7 +42,9 @@ class Bench:
     """
     A device that does what it is told.
 
-    :ivar driven: torques of every step; speeds are followed in proportion, within the limits.
+    :ivar driven: torques of every step; speeds are followed in proportion, within the limits, and
+        without power there is none.
+    :ivar powered: which wheels had power in every step.
     :ivar gate: set by whoever wants to know its state (and reason) at the last step.
     :ivar gate_then: that state and reason.
     :ivar links: the links that give a sample.
@@ -57,6 +59,7 @@ class Bench:
         self.mechanism = mechanism
         self.period_ns = PERIOD_NS
         self.driven: list[Array] = []
+        self.powered: list[list[bool]] = []
         self.links: tuple[int, ...] = (0, 1, 2, 3)
         self.breaks = False
         self.gate = ArmingGate()
@@ -71,7 +74,9 @@ class Bench:
         """Take down the torques and let the wheels follow them."""
         inertias, limits = self.mechanism.flywheel_inertias, self.mechanism.motor_torque_limits
         following = np.clip(30.0 * inertias * (drive.values - self.speeds), -limits, limits)
-        torques = np.where(drive.by_speed, following, drive.values)
+        torques = np.where(
+            drive.powered, np.where(drive.by_speed, following, drive.values), 0.0)
+        self.powered.append(drive.powered.tolist())
         self.driven.append(torques)
         self.gate_then = (self.gate.state, self.gate.reason)
         if self.breaks:
@@ -116,6 +121,11 @@ class Operated:
         """The torques of the last step."""
         torques: list[float] = self.bench.driven[-1].tolist()
         return torques
+
+    @property
+    def powered(self) -> list[bool]:
+        """Which wheels had power in the last step."""
+        return self.bench.powered[-1]
 
 
 @pytest.fixture(scope='session')

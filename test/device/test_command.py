@@ -42,14 +42,16 @@ def test_names_may_come_in_any_order(order: tuple[int, ...]) -> None:
                             (drive_by_name(names, [], values, []), True)):
         assert drive.values.tolist() == [10.0, 11.0, 12.0, 13.0]
         assert drive.by_speed.tolist() == [by_speed] * 4
+        assert drive.powered.all()
 
 
 @settings(derandomize=True)
 @given(given_torques=st.dictionaries(st.sampled_from(FLYWHEEL_NAMES), finite, min_size=1))
-def test_wheel_that_is_not_named_gets_none(given_torques: dict[str, float]) -> None:
+def test_wheel_that_is_not_named_has_no_power(given_torques: dict[str, float]) -> None:
     drive = drive_by_name(list(given_torques), [], [], list(given_torques.values()))
     assert drive.values.tolist() == [given_torques.get(name, 0.0) for name in FLYWHEEL_NAMES]
     assert not drive.by_speed.any()
+    assert drive.powered.tolist() == [name in given_torques for name in FLYWHEEL_NAMES]
 
 
 @settings(derandomize=True)
@@ -58,6 +60,7 @@ def test_wheel_whose_speed_is_not_named_coasts(speeds: dict[str, float]) -> None
     drive = drive_by_name(list(speeds), [], list(speeds.values()), [])
     assert drive.values.tolist() == [speeds.get(name, 0.0) for name in FLYWHEEL_NAMES]
     assert drive.by_speed.tolist() == [name in speeds for name in FLYWHEEL_NAMES]
+    assert drive.powered.tolist() == [name in speeds for name in FLYWHEEL_NAMES]
 
 
 @pytest.mark.parametrize('name', ['flywheel_e', 'link_a', '', 'Flywheel_a'])

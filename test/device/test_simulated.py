@@ -42,7 +42,7 @@ Make = Callable[..., SimulatedTable]
 MS = 1_000_000
 PERIOD_NS = 4 * MS
 FIRST_NS = 1_000_000_000
-NO_SPEED = np.zeros(4, dtype=bool)
+NO_SPEED, ALL = np.zeros(4, dtype=bool), np.ones(4, dtype=bool)
 PUSH = np.array([2e-3, -1e-3, 1.5e-3, 3e-3])
 
 
@@ -69,7 +69,7 @@ def make(ideal: Mechanism) -> Make:
 
 def run(table: SimulatedTable, ticks: int, torques: Array = PUSH, first: int = 0
         ) -> list[Samples]:
-    return [table.step(FIRST_NS + n * table.period_ns, Drive(torques, NO_SPEED))
+    return [table.step(FIRST_NS + n * table.period_ns, Drive(torques, NO_SPEED, ALL))
             for n in range(first, first + ticks)]
 
 
@@ -149,6 +149,22 @@ def test_runaway_turns_by_itself_at_most_by_its_limit(make: Make) -> None:
         assert not speeds[:3].any()
 
 
+@pytest.mark.parametrize(('kind', 'cut'), [('runaway', True), ('shorted', False)])
+def test_power_of_one_wheel_is_cut_and_comes_back(kind: str, cut: bool, make: Make) -> None:
+    """With the tick, a runaway as well as what is asked for, but no short."""
+    table = make()
+    table.break_down('flywheel_d', Fault('flywheel_d', kind, 4e-3))
+    rng = np.random.default_rng(7)
+    table.step(FIRST_NS, Drive(PUSH, NO_SPEED, ALL))
+    for n in range(1, 60):
+        powered = rng.random(4) < 0.5
+        sample = table.step(FIRST_NS + n * PERIOD_NS, Drive(PUSH, NO_SPEED, powered))
+        expected = np.where(powered, PUSH, 0.0)
+        expected[3] = 4e-3 if powered[3] or not cut else 0.0
+        np.testing.assert_allclose(
+            sample.wheels.efforts, expected, rtol=1e-12, err_msg=f'seed 7, tick {n}')
+
+
 def test_stuck_wheel_turns_with_its_link_up_to_the_torque_of_the_brake(make: Make) -> None:
     table = make(initial=InitialState())
     table.break_down('flywheel_a', Fault('flywheel_a', 'stuck', 5e-3))
@@ -174,12 +190,32 @@ def test_delayed_motor_does_what_was_asked_before(delay_ms: float, make: Make) -
     table.break_down('flywheel_c', Fault('flywheel_c', 'delayed', delay_ms * 1e-3))
     asked = np.random.default_rng(2).uniform(-3e-3, 3e-3, (40, 4))
     wanted = np.concatenate([np.zeros(delay), np.repeat(asked[:, 2], 8)])
-    table.step(FIRST_NS, Drive(np.zeros(4), NO_SPEED))
+    table.step(FIRST_NS, Drive(np.zeros(4), NO_SPEED, ALL))
     for n, torques in enumerate(asked):
-        sample = table.step(FIRST_NS + (n + 1) * PERIOD_NS, Drive(torques, NO_SPEED))
+        sample = table.step(FIRST_NS + (n + 1) * PERIOD_NS, Drive(torques, NO_SPEED, ALL))
         expected = torques.copy()
         expected[2] = wanted[8 * n:8 * n + 8].mean()
         np.testing.assert_allclose(sample.wheels.efforts, expected, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize('delay_ms', [0.5, 10.0, 50.0])
+def test_delayed_motor_is_cut_at_once(delay_ms: float, make: Make) -> None:
+    """Power comes back at once as well, to a motor that is late with its commands as before."""
+    table = make()
+    delay = round(delay_ms / 0.5)
+    table.break_down('flywheel_c', Fault('flywheel_c', 'delayed', delay_ms * 1e-3))
+    rng = np.random.default_rng(5)
+    powered = rng.random((60, 4)) < 0.7
+    asked = np.where(powered, rng.uniform(-3e-3, 3e-3, (60, 4)), 0.0)
+    wanted = np.concatenate([np.zeros(delay), np.repeat(asked[:, 2], 8)])
+    table.step(FIRST_NS, Drive(np.zeros(4), NO_SPEED, ALL))
+    for n in range(60):
+        sample = table.step(
+            FIRST_NS + (n + 1) * PERIOD_NS, Drive(asked[n], NO_SPEED, powered[n]))
+        expected = asked[n].copy()
+        expected[2] = wanted[8 * n:8 * n + 8].mean() if powered[n, 2] else 0.0
+        np.testing.assert_allclose(sample.wheels.efforts, expected, rtol=1e-12, atol=1e-15,
+                                   err_msg=f'seed 5, period {n}')
 
 
 def test_delay_that_comes_later_goes_back_in_time(make: Make) -> None:
@@ -189,7 +225,7 @@ def test_delay_that_comes_later_goes_back_in_time(make: Make) -> None:
     for n, torques in enumerate(asked):
         if n == 20:
             table.break_down('flywheel_a', Fault('flywheel_a', 'delayed', 0.02))
-        sample = table.step(FIRST_NS + n * PERIOD_NS, Drive(torques, NO_SPEED))
+        sample = table.step(FIRST_NS + n * PERIOD_NS, Drive(torques, NO_SPEED, ALL))
         if n:
             assert sample.wheels.efforts[0] == pytest.approx(
                 torques[0] if n < 20 else asked[n - 5, 0], rel=1e-12)
@@ -197,13 +233,27 @@ def test_delay_that_comes_later_goes_back_in_time(make: Make) -> None:
 
 def test_speed_commands_reach_the_motors(make: Make) -> None:
     table = make(initial=InitialState())
-    mixed = Drive(np.array([20.0, 0.0, 1e-3, -10.0]), np.array([True, False, False, True]))
+    mixed = Drive(np.array([20.0, 0.0, 1e-3, -10.0]), np.array([True, False, False, True]), ALL)
     for n in range(200):
         sample = table.step(FIRST_NS + n * PERIOD_NS, mixed)
     assert sample.truth is not None
     np.testing.assert_allclose(sample.truth.wheel_speeds[[0, 3]], [20.0, -10.0], atol=1e-2)
     assert sample.wheels.efforts[1] == 0.0
     assert sample.wheels.efforts[2] == pytest.approx(1e-3)
+
+
+def test_wheel_that_follows_a_speed_coasts_while_it_is_cut(make: Make) -> None:
+    """And is followed again, from wherever it is then."""
+    table = make(initial=InitialState())
+    wanted, only_b = np.array([20.0, 0.0, 0.0, -10.0]), np.array([False, True, False, False])
+    for n in range(300):
+        cut = 100 <= n < 200
+        sample = table.step(FIRST_NS + n * PERIOD_NS, Drive(
+            -wanted if cut else wanted, ALL, only_b if cut else ALL))
+        assert sample.truth is not None
+        if cut:
+            assert not sample.wheels.efforts[[0, 2, 3]].any()
+    np.testing.assert_allclose(sample.truth.wheel_speeds, wanted, atol=1e-2)
 
 
 def test_scheduled_faults_come_and_go_on_time(make: Make) -> None:
@@ -275,7 +325,7 @@ def test_tilt_that_throws_the_linkage_off_the_table_is_told(ideal: Mechanism) ->
     for n in range(400):
         if 'edge' in table.diagnosis():
             break
-        table.step(FIRST_NS + n * PERIOD_NS, Drive(np.zeros(4), NO_SPEED))
+        table.step(FIRST_NS + n * PERIOD_NS, Drive(np.zeros(4), NO_SPEED, ALL))
     assert table.diagnosis()['edge'].startswith('the linkage has met the edge of the table, ')
     table.reset(InitialState())
     assert table.diagnosis() == {}

@@ -30,7 +30,7 @@ from fourbar_ros.device import (
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import angular_momentum, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.by_name import RejectedError
-from fourbar_ros.plant import InitialState, Plant, PlantError, Table
+from fourbar_ros.plant import Fault, InitialState, Plant, PlantError, Table
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelEncoders
 from hypothesis import given, note, settings
@@ -45,7 +45,8 @@ Operate = Callable[..., Any]
 NONE = [0.0, 0.0, 0.0, 0.0]
 PERIOD_NS = 4_000_000
 LIMIT = 1e-4
-NO_SPEED = np.zeros(4, dtype=bool)
+NO_SPEED, ALL = np.zeros(4, dtype=bool), np.ones(4, dtype=bool)
+OFF = [False] * 4
 
 
 # Commands
@@ -56,9 +57,20 @@ def test_accepted_command_drives_from_the_next_step_on(operate: Operate) -> None
     for _ in range(3):
         bed.tick()
         assert bed.driven == [1e-5, -2e-5, 3e-5, -4e-5]
+    assert bed.powered == [True] * 4
     bed.command(5e-5)
     bed.tick()
     assert bed.driven == [5e-5, 0.0, 0.0, 0.0]
+    assert bed.powered == [True, False, False, False]
+
+
+def test_command_of_zero_torque_powers_the_wheels_that_it_names(operate: Operate) -> None:
+    bed = operate()
+    bed.tick()
+    assert bed.powered == OFF
+    bed.command(0.0, 0.0, names=['flywheel_d', 'flywheel_b'])
+    bed.tick()
+    assert bed.powered == [False, True, False, True]
 
 
 def test_more_than_a_motor_has_is_clipped_and_counted(operate: Operate) -> None:
@@ -91,6 +103,7 @@ def test_rejected_command_changes_nothing_but_its_counter(
     assert bed.testbed.last_rejection == str(caught.value)
     bed.tick()
     assert bed.driven == [1e-5, 2e-5, 0.0, 0.0]
+    assert bed.powered == [True, True, False, False]
 
 
 @pytest.mark.parametrize('ahead_ms', [-101, 1, 1000, -3_600_000])
@@ -187,23 +200,23 @@ def test_other_obstacles_are_told_too(operate: Operate) -> None:
 
 
 @pytest.mark.parametrize('way', ['disarm', 'emergency_stop'])
-def test_every_way_out_of_armed_ends_torque(way: str, operate: Operate) -> None:
+def test_every_way_out_of_armed_ends_torque_and_power(way: str, operate: Operate) -> None:
     bed = operate()
     bed.command(1e-5)
     bed.tick()
     getattr(bed.testbed, way)('test')
     bed.tick()
-    assert bed.driven == NONE
+    assert (bed.driven, bed.powered) == (NONE, OFF)
     bed.command(1e-5)
     bed.tick()
-    assert bed.driven == NONE
+    assert (bed.driven, bed.powered) == (NONE, OFF)
     if way == 'emergency_stop':
         assert not bed.arm()[0]
         assert bed.testbed.reset()[0]
         assert bed.testbed.gate.state is DeviceState.DISARMED
     assert bed.arm()[0]
     bed.tick()
-    assert bed.driven == NONE
+    assert (bed.driven, bed.powered) == (NONE, OFF)
 
 
 def test_failing_device_latches_a_fault(operate: Operate) -> None:
@@ -216,7 +229,7 @@ def test_failing_device_latches_a_fault(operate: Operate) -> None:
     assert bed.testbed.gate.state is DeviceState.FAULT
     assert bed.testbed.gate.reason == 'the bus is off'
     bed.tick()
-    assert bed.driven == NONE
+    assert (bed.driven, bed.powered) == (NONE, OFF)
     assert not bed.arm()[0]
     bed.testbed.reset()
     assert bed.arm()[0]
@@ -240,6 +253,26 @@ def test_watchdog_disarms_after_the_timeout(operate: Operate) -> None:
     bed.command(1e-5)
     bed.tick()
     assert bed.driven == NONE
+
+
+@pytest.mark.parametrize(('action', 'powered'), [
+    ('coast', False), ('hold_speed', True), ('brake', True)])
+def test_wheels_keep_their_power_only_where_the_watchdog_parks_them(
+    action: str, powered: bool, operate: Operate,
+) -> None:
+    """All of them, whichever the last command named."""
+    bed = operate(timeout_action=action)
+    bed.command(1e-5)
+    for _ in range(25):
+        bed.tick()
+        assert bed.powered == [True, False, False, False]
+    for _ in range(3):
+        bed.tick()
+        assert bed.testbed.gate.state is DeviceState.DISARMED
+        assert bed.powered == [powered] * 4
+    bed.testbed.emergency_stop('test')
+    bed.tick()
+    assert bed.powered == OFF
 
 
 def test_watchdog_waits_as_long_for_the_first_command(operate: Operate) -> None:
@@ -410,11 +443,11 @@ def test_wheels_are_driven_only_when_allowed_and_within_limits(
     """
     Torque passes only while armed, or parking after the watchdog, and never beyond the limits.
 
-    Armed and without an accepted command since, there is none either.
+    Armed it has power where the last command since then names the wheel, parking everywhere.
     """
     bed = operate(timeout_action=action)
     gate = bed.testbed.gate
-    commanded = False
+    named = 0
     for name, value in events:
         before = gate.state
         if name == 'tick':
@@ -429,11 +462,13 @@ def test_wheels_are_driven_only_when_allowed_and_within_limits(
                        and reason.startswith('no flywheel_command'))
             if torques.any():
                 note(f'{state} {reason}')
-                assert (state is DeviceState.ARMED and commanded) or parking
+                assert (state is DeviceState.ARMED and named) or parking
+            live = 4 if parking else named if state is DeviceState.ARMED else 0
+            assert bed.powered == [wheel < live for wheel in range(4)], f'{state} {reason}'
         elif name == 'command':
             try:
                 bed.command(*value)
-                commanded = True
+                named = len(value)
             except RejectedError:
                 pass
         elif name == 'old command':
@@ -441,7 +476,7 @@ def test_wheels_are_driven_only_when_allowed_and_within_limits(
                 bed.command(1e-5, ahead_ns=-10 ** 12)
         elif name == 'arm':
             if bed.arm()[0] and before is not DeviceState.ARMED:
-                commanded = False
+                named = 0
         elif name == 'disarm':
             bed.testbed.disarm('test')
         elif name == 'stop':
@@ -537,11 +572,11 @@ def test_wheel_speeds_are_what_the_encoders_moved(paper: Mechanism) -> None:
     plant = Plant(paper, Table(LinkSensorSettings(), WheelEncoders(4096)), InitialState(), 5e-4,
                   np.random.default_rng(0))
     table = SimulatedTable(plant, PERIOD_NS)
-    before = table.step(0, Drive(np.zeros(4), NO_SPEED))
+    before = table.step(0, Drive(np.zeros(4), NO_SPEED, ALL))
     for n in range(1, 20):
         # Every third tick comes two periods late.
         stamp = before.stamp_ns + PERIOD_NS * (3 if n % 3 == 0 else 1)
-        now = table.step(stamp, Drive(np.full(4, 5e-5), NO_SPEED))
+        now = table.step(stamp, Drive(np.full(4, 5e-5), NO_SPEED, ALL))
         moved = (now.wheels.angles - before.wheels.angles) / ((stamp - before.stamp_ns) * 1e-9)
         np.testing.assert_allclose(now.wheels.speeds, moved, rtol=1e-12)
         before = now
@@ -550,6 +585,46 @@ def test_wheel_speeds_are_what_the_encoders_moved(paper: Mechanism) -> None:
     truth = before.truth
     assert truth is not None
     np.testing.assert_allclose(truth.wheel_speeds + truth.link_rates, expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize(('kind', 'cut'), [('runaway', True), ('shorted', False)])
+def test_what_gives_torque_by_itself_while_disarmed(
+    kind: str, cut: bool, paper: Mechanism,
+) -> None:
+    """A runaway needs power, a short does not; both push while the wheel is powered."""
+    plant = Plant(paper, Table(LinkSensorSettings(), WheelEncoders(0)), InitialState(), 5e-4,
+                  np.random.default_rng(0))
+    table = SimulatedTable(plant, PERIOD_NS)
+    table.break_down('flywheel_b', Fault('flywheel_b', kind, 5e-5))
+    testbed = Testbed(table, TestbedSettings())
+    now = 0
+
+    def efforts(wheels: str = '') -> list[float]:
+        """Command some wheels, or none, and return what acts then."""
+        nonlocal now
+        if wheels:
+            names = [f'flywheel_{letter}' for letter in wheels]
+            testbed.command(now, names, [], [], [1e-5] * len(names), now)
+        now += PERIOD_NS
+        samples, _ = testbed.tick(now, now)
+        given: list[float] = samples.wheels.efforts.tolist()
+        return given
+
+    idle = pytest.approx([0.0, 0.0 if cut else 5e-5, 0.0, 0.0], rel=1e-12)
+    efforts()
+    assert efforts() == idle
+    assert efforts('abcd') == idle
+    assert testbed.arm(now, [])[0]
+    assert efforts() == idle
+    assert efforts('abcd') == pytest.approx([1e-5, 5e-5, 1e-5, 1e-5], rel=1e-12)
+    assert efforts('acd') == pytest.approx([1e-5, 0.0 if cut else 5e-5, 1e-5, 1e-5], rel=1e-12)
+    assert efforts('b') == pytest.approx([0.0, 5e-5, 0.0, 0.0], rel=1e-12)
+    testbed.disarm('test')
+    assert efforts() == idle
+    testbed.arm(now, [])
+    efforts('abcd')
+    testbed.emergency_stop('test')
+    assert efforts('abcd') == idle
 
 
 def test_period_that_is_no_multiple_of_the_step_is_refused(paper: Mechanism) -> None:
