@@ -91,6 +91,32 @@ def test_dead_wheel_gives_no_torque(testbed):
     testbed.arm(False)
 
 
+@pytest.mark.parametrize(('kind', 'cut'), [('runaway', True), ('shorted', False)])
+def test_wheel_that_is_not_named_loses_its_power(kind, cut, testbed):
+    """Which ends a runaway, as disarming does, and no short."""
+    def efforts():
+        return list(testbed.received['sim/flywheel_states'][-1].effort)
+
+    def without_b():
+        tick = testbed.received['sim/flywheel_states'][-1].header.stamp
+        testbed.command(tick.sec * 1_000_000_000 + tick.nanosec, effort=[2e-6] * 3,
+                        names=['flywheel_a', 'flywheel_c', 'flywheel_d'])
+        return efforts() == pytest.approx([2e-6, 0.0 if cut else 1e-5, 2e-6, 2e-6])
+
+    testbed.drive([1e-6] * 4)
+    assert set_fault(testbed, 'fault.flywheel_b', f'{kind} 1e-5')[0]
+    testbed.wait(lambda: testbed.arm().success)
+    testbed.wait(lambda: efforts() == pytest.approx([1e-6, 1e-5, 1e-6, 1e-6]))
+    testbed.drive(None)
+    testbed.wait(without_b)
+    testbed.drive([1e-6] * 4)
+    testbed.wait(lambda: efforts() == pytest.approx([1e-6, 1e-5, 1e-6, 1e-6]))
+    testbed.arm(False)
+    testbed.wait(lambda: efforts() == pytest.approx([0.0, 0.0 if cut else 1e-5, 0.0, 0.0]))
+    assert set_fault(testbed, 'fault.flywheel_b', 'none')[0]
+    testbed.wait(lambda: not any(efforts()))
+
+
 @pytest.mark.parametrize(('name', 'text', 'word'), [
     ('fault.link_a', 'broken', "unknown fault 'broken' of link_a"),
     ('fault.link_a', 'intermittent 1.5', 'from 0 to 1'),
