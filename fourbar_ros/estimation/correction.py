@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from math import pi, sqrt
 
+from fourbar_ros.estimation.elastic import take_lengths
 from fourbar_ros.estimation.prediction import meet
 from fourbar_ros.estimation.suspicion import FAULTY, judge, seen_again, VERDICT, weigh
 from fourbar_ros.mechanism.compiled import kernel
@@ -36,7 +37,7 @@ BEYOND = 4.0
 @kernel
 def correct(x: Array, covariance: Array, suspicions: Array, sensors: NDArray[np.int64],
             rows: Array, measured: Array, variances: Array, gate: float,
-            spared: NDArray[np.bool_], boxed: NDArray[np.record], state: Array,
+            spared: NDArray[np.bool_], loose: bool, boxed: NDArray[np.record], state: Array,
             ) -> tuple[Array, Array, Array, Array, Array, float, NDArray[np.int64]]:
     """
     Correct in place: filterpy's `update`, with wrapped innovations and a gate for each sample.
@@ -49,6 +50,7 @@ def correct(x: Array, covariance: Array, suspicions: Array, sensors: NDArray[np.
     :param variances: (m,) of each.
     :param gate: largest normalised square of an innovation that is used.
     :param spared: (sensors,) those that are used even if found at fault.
+    :param loose: whether the loop may fail to close.
     :param boxed: (1,) constants of the mechanism, wheels locked.
     :param state: (STATE_SIZE,) to work in.
     :returns: y (m,), and the square of each over its variance (m,); of the k samples that were
@@ -117,8 +119,10 @@ def correct(x: Array, covariance: Array, suspicions: Array, sensors: NDArray[np.
     else:
         _weigh_refused(suspicions, sensors, rows, y, squares, variances, gate, fate, before, gain)
     judge(x, covariance, suspicions, spared)
+    if loose:
+        take_lengths(x, boxed[0])
     state[0:8] = x[0:8]
-    meet(state, covariance, boxed[0])
+    meet(state, covariance, loose, boxed[0])
     x[0:8] = state[0:8]
     return y, squares, s, inverse, gain, nis, fate
 

@@ -46,7 +46,7 @@ from fourbar_ros.estimation.estimate import (
 )
 from fourbar_ros.estimation.filter import Correction, GYROS, LinkageFilter, Snapshot
 from fourbar_ros.estimation.health import SensorHealth
-from fourbar_ros.estimation.layout import ANGLES, BIASES, RATES, TORQUES
+from fourbar_ros.estimation.layout import ANGLES, RATES, TORQUES
 from fourbar_ros.estimation.measurement import Measurement, read_measurement, sensor_name
 from fourbar_ros.estimation.settings import EstimatorSettings
 from fourbar_ros.mechanism import ClosureError, Mechanism, SENSOR_NAMES
@@ -329,7 +329,7 @@ class Estimator:
         return Estimate(
             stamp_ns, x[ANGLES], x[RATES], sigmas[ANGLES], sigmas[RATES], linkage.free_covariance,
             x[TORQUES], sigmas[TORQUES],
-            {gyro - GYROS: float(bias) for gyro, bias in zip(linkage.gyros, x[BIASES:])},
+            {gyro - GYROS: float(bias) for gyro, bias in zip(linkage.gyros, linkage.gyro_biases)},
             innovation)
 
     def _decide(self, decision: Decision) -> None:
@@ -592,8 +592,9 @@ class Estimator:
             # Two angles do not tell the others here, but four tell what they are.
             near, rates = tuple(measured.tolist()), (0.0, 0.0, 0.0, 0.0)
             constants = self._mechanism.with_rigid_joints().constants
+            exact = self._settings.closure_tolerance == 0.0
             for _ in range(NEWTON_STEPS):
-                near, _ = project_onto_closure(near, rates, constants, True)
+                near, _ = project_onto_closure(near, rates, constants, exact)
             if np.abs(near - measured).max() < NEARBY:
                 return np.array(near)
         known = [link for link in range(4) if isfinite(measured[link])]

@@ -28,7 +28,16 @@ from typing import NamedTuple
 
 from filterpy.kalman import ExtendedKalmanFilter
 from fourbar_ros.estimation.correction import correct, USED
-from fourbar_ros.estimation.layout import ANGLES, BIASES, FREE, RATES, TORQUES
+from fourbar_ros.estimation.elastic import turned_by_lengths
+from fourbar_ros.estimation.layout import (
+    ANGLES,
+    BIASES,
+    FREE,
+    LENGTHS,
+    LOOSE_BIASES,
+    RATES,
+    TORQUES,
+)
 from fourbar_ros.estimation.prediction import near_change_point, predict
 from fourbar_ros.estimation.suspicion import (
     BIAS,
@@ -39,6 +48,7 @@ from fourbar_ros.estimation.suspicion import (
     VERDICT,
 )
 from fourbar_ros.mechanism import JOINT_LINKS, Mechanism, SENSOR_NAMES
+from fourbar_ros.mechanism.closure import SIGNS
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix
 from fourbar_ros.mechanism.layout import STATE_SIZE
@@ -61,6 +71,11 @@ _PARTNERS = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
 INITIAL_BIAS_SIGMA = 0.1
 WALKED_BEFORE = 10.0
 
+# How fast lengths may change, relative to how far they may be off [1/sqrt(s)]; and for how long
+# what turns opposite links apart stays the same [s].
+LENGTH_WALK = 0.01
+APART_FOR = 0.3
+
 Snapshot = tuple[Array, Array, Array, tuple[int, ...]]
 
 
@@ -71,11 +86,14 @@ class Randomness(NamedTuple):
     :param torque: of white torques on each link [N m/sqrt(Hz)].
     :param torque_walk: of the disturbance torques on links a and b [N m/sqrt(s)].
     :param gyro_walk: of the biases of gyros [rad/s/sqrt(s)].
+    :param closure: no density, but how far the loop fails to close with the lengths that are
+        given, as a standard deviation [m]; 0 where these are exact.
     """
 
     torque: float
     torque_walk: float = 0.0
     gyro_walk: float = 0.0
+    closure: float = 0.0
 
 
 class Correction(NamedTuple):
@@ -109,12 +127,50 @@ class _Layout(NamedTuple):
     spared: NDArray[np.bool_]
 
 
+def _slack(mechanism: Mechanism, randomness: Randomness) -> Array:
+    """Return what the kernels are told of a loop that may fail to close, see elastic."""
+    if not randomness.closure:
+        return np.zeros(0)
+    stiffness, damping, lighter = inf, 0.0, 0.0
+    if np.isfinite(mechanism.joint_stiffness).all():
+        stiffness = 1.0 / float((1.0 / mechanism.joint_stiffness).sum())
+        # At one pull in all of them, each joint has this share of the gap.
+        shares = stiffness / mechanism.joint_stiffness
+        damping = float(mechanism.joint_damping @ shares ** 2)
+        lighter = _lighter(mechanism, shares)
+    lengths = mechanism.link_lengths
+    parallel = np.abs(lengths[:2] - lengths[2:]).max() <= randomness.closure
+    return np.array([LENGTH_WALK * randomness.closure, stiffness, damping, lighter,
+                     APART_FOR * randomness.torque_walk, 0.5 if parallel else 0.0])
+
+
+def _lighter(mechanism: Mechanism, shares: Array) -> float:
+    """
+    Work out by what mass links are lighter to joints that share a gap than with it in joint 3.
+
+    All but link a move by their share of the gap's rate, on top of what the rates of the links
+    tell. Of the impulse that this adds to each link angle only that counts which the gap itself
+    has, `s_i l_i`: the rest is for motions that leave the gap alone.
+
+    :param shares: (4,) of the joints in the gap.
+    """
+    masses = mechanism.link_masses
+    # Joint 1 is between a and b, 2 between b and c, and 4 between d and a.
+    moved = np.array([0.0, -shares[0], -shares[0] - shares[1], shares[3]])
+    moved -= masses @ moved / masses.sum()
+    signed = np.array(SIGNS) * mechanism.link_lengths
+    added = (masses * moved) @ mechanism.constants.arms[:, :, 0]
+    return float(-2.0 * added @ signed / (signed @ signed) - masses @ moved ** 2)
+
+
 class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
     """
     The filter proper: predict with wheel motion, correct with measured angles and rates.
 
     State, covariances, gain and innovation are filterpy's attributes. Its two steps are done by
     compiled kernels.
+
+    Where the loop may fail to close, the stiffness of the mechanism's joints counts, too.
 
     :param mechanism: the linkage.
     :param angles: (4,) initial link angles on the closure, continuous [rad].
@@ -125,25 +181,30 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
 
     def __init__(self, mechanism: Mechanism, angles: Array, angle_variance: float,
                  rate_variance: float, randomness: Randomness) -> None:
-        super().__init__(dim_x=BIASES, dim_z=4)
+        super().__init__(dim_x=LOOSE_BIASES if randomness.closure else BIASES, dim_z=4)
         # An array of one: a record by itself takes longer to hand to a kernel than it runs.
         self._constants = np.array(
             [mechanism.with_rigid_joints().constants_with(np.ones(4, dtype=bool))])
         self._lengths = mechanism.link_lengths
-        self._densities = np.array(randomness)
+        self._densities = np.array(randomness[:3])
+        self._slack = _slack(mechanism, randomness)
+        self._loose = self._slack.size > 0
+        self._biases = LOOSE_BIASES if self._loose else BIASES
         self._state = np.zeros(STATE_SIZE)
         self._gyros: tuple[int, ...] = ()
         self._layouts: dict[tuple[int, ...], _Layout] = {}
-        self.x = np.zeros(BIASES)
+        self.x = np.zeros(self._biases)
         self.x[ANGLES] = angles
-        self.P = np.zeros((BIASES, BIASES))
+        self.P = np.zeros((self._biases, self._biases))
         links = np.eye(4)
         if not near_change_point(self.x):
             links = self._after_two()
         self.P[ANGLES, ANGLES] = angle_variance * links @ links.T
         self.P[RATES, RATES] = rate_variance * links @ links.T
         self.P[TORQUES, TORQUES] = WALKED_BEFORE * randomness.torque_walk ** 2 * np.eye(2)
-        self._suspicions = no_suspicions(len(SENSOR_NAMES), BIASES)
+        if self._loose:
+            self._begin_lengths(0.5 * randomness.closure)
+        self._suspicions = no_suspicions(len(SENSOR_NAMES), self._biases)
 
     @property
     def angles(self) -> Array:
@@ -161,6 +222,20 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
     def gyros(self) -> tuple[int, ...]:
         """Return the gyros whose biases are in the state, in their order."""
         return self._gyros
+
+    @property
+    def gyro_biases(self) -> Array:
+        """Return the biases of the gyros, in their order [rad/s]."""
+        biases: Array = self.x[self._biases:]
+        return biases
+
+    @property
+    def lengths(self) -> Array:
+        """Return the lengths of the links with which the loop closes (4,) [m]."""
+        lengths: Array = self._lengths.copy()
+        if self._loose:
+            lengths[1:] = self.x[LENGTHS]
+        return lengths
 
     @property
     def free_covariance(self) -> Array:
@@ -212,7 +287,7 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         if unknown_torque:
             densities = densities.copy()
             densities[1] = sqrt(densities[1] ** 2 + unknown_torque ** 2)
-        predict(self.x, self.P, self._suspicions, wheel_torques, duration, densities,
+        predict(self.x, self.P, self._suspicions, wheel_torques, duration, densities, self._slack,
                 self._constants, self._state, self.F, self.Q)
 
     def correct(self, sensors: tuple[int, ...], measured: Array, variance: ArrayLike,
@@ -235,12 +310,26 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         variances[:] = variance
         self.y, squares, self.S, self.SI, self.K, nis, fate = correct(
             self.x, self.P, self._suspicions, layout.sensors, layout.rows, measured, variances,
-            gate, layout.spared, self._constants, self._state)
+            gate, layout.spared, self._loose, self._constants, self._state)
         return Correction(self.y, nis, squares, fate)
 
     def _after_two(self) -> Array:
         """Return what all four rates are after those of links a and b (4, 2)."""
         return np.vstack([np.eye(2), gamma_matrix(self.x, self._lengths)])
+
+    def _begin_lengths(self, sigma: float) -> None:
+        """Take the lengths of links b, c and d into the state, by the error of each link [m]."""
+        lengths = self._lengths[1:]
+        self.x[LENGTHS] = lengths
+        # Relative to that of link a.
+        scale = lengths / self._lengths[0]
+        covariance = sigma ** 2 * (np.eye(3) + np.outer(scale, scale))
+        self.P[LENGTHS, LENGTHS] = covariance
+        if not near_change_point(self.x):
+            turned = turned_by_lengths(self.x, self._lengths)
+            self.P[2:4, 2:4] += turned @ covariance @ turned.T
+            self.P[2:4, LENGTHS] = turned @ covariance
+            self.P[LENGTHS, 2:4] = self.P[2:4, LENGTHS].T
 
     def _with_verdict(self, verdict: float) -> dict[int, float]:
         table, found = self._suspicions, {}
@@ -259,7 +348,7 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
                 row[ANGLES] = SENSOR_ROWS[sensor]
             else:
                 row[RATES] = SENSOR_ROWS[sensor - GYROS]
-                row[BIASES + self._gyros.index(sensor)] = 1.0
+                row[self._biases + self._gyros.index(sensor)] = 1.0
         spared = np.ones(len(SENSOR_NAMES), np.bool_)
         angles = [sensor for sensor in sensors if sensor < GYROS]
         for sensor in angles:

@@ -20,12 +20,27 @@ alone. Near them (mechanism.reduced, NEAR_ALIGNMENT) all four links are states i
 the transition is that of free links, and the closure and its rate come as measurements without
 noise. Where the links cannot be told from a line, by what is known of them, the constraint that is
 lost there holds nothing.
+
+A loop that may fail to close does so with the lengths that are in the state, and near change
+points its joints are springs along the constraint that is lost (estimation.elastic).
 """
 
 from __future__ import annotations
 
-from math import sin
+from math import ceil, sin
 
+from fourbar_ros.estimation.elastic import (
+    add_elasticity,
+    FASTEST,
+    lighten,
+    move_elastic,
+    RIGID_FROM,
+    SHARED,
+    take_lengths,
+    turned_by_lengths,
+    WALK,
+)
+from fourbar_ros.estimation.layout import LOOSE_BIASES
 from fourbar_ros.estimation.suspicion import carry_suspicion, SCALARS
 from fourbar_ros.mechanism.compiled import kernel
 from fourbar_ros.mechanism.constants import Array, Constants
@@ -61,6 +76,12 @@ HELD_FROM = 9.0
 CLOSED_TO = 1e-8
 STOPPED_TO = 1e-6
 
+# The same for a loop that may fail to close, whose joints give a little in every direction. What is
+# known of the direction of the line has a part in what the closure tells there; if that was without
+# noise, again and again, the direction along the line would seem to be known, too.
+GIVES_TO = 1e-5
+GIVES_AT = 1e-3
+
 
 @kernel
 def near_change_point(x: Array) -> bool:
@@ -70,8 +91,8 @@ def near_change_point(x: Array) -> bool:
 
 @kernel
 def predict(x: Array, covariance: Array, suspicions: Array, wheel_torques: Array,
-            duration: float, densities: Array, boxed: NDArray[np.record], state: Array,
-            transition: Array, noise: Array) -> None:
+            duration: float, densities: Array, slack: Array, boxed: NDArray[np.record],
+            state: Array, transition: Array, noise: Array) -> None:
     """
     Predict in place: filterpy's `predict` with the linkage as the model.
 
@@ -81,24 +102,52 @@ def predict(x: Array, covariance: Array, suspicions: Array, wheel_torques: Array
     :param duration: [s].
     :param densities: (3,) of random torques on each link [N m/sqrt(Hz)], and of the random walks
         of the disturbance torques [N m/sqrt(s)] and of the biases of gyros [rad/s/sqrt(s)].
+    :param slack: what is known of a loop that may fail to close, see estimation.elastic, or
+        nothing (0,).
     :param boxed: (1,) constants of the mechanism, wheels locked.
     :param state: (STATE_SIZE,) to work in.
-    :param transition, noise: (n, n) receive F and Q.
+    :param transition, noise: (n, n) receive F and Q, of the last part where the motion along the
+        weak direction is too fast for one step.
     """
     constants = boxed[0]
-    size = x.size
+    parts = 1
+    if slack.size > 0:
+        take_lengths(x, constants)
+        if near_change_point(x):
+            parts = max(1, int(ceil(duration * FASTEST)))
+    for _ in range(parts):
+        _predict_part(x, covariance, suspicions, wheel_torques, duration / parts, densities,
+                      slack, constants, state, transition, noise)
+
+
+@kernel
+def _predict_part(x: Array, covariance: Array, suspicions: Array, wheel_torques: Array,
+                  duration: float, densities: Array, slack: Array, constants: Constants,
+                  state: Array, transition: Array, noise: Array) -> None:
+    size, loose = x.size, slack.size > 0
     transition[:] = 0.0
     noise[:] = 0.0
     for i in range(8, size):
         transition[i, i] = 1.0
     for i in range(10, size):
-        noise[i, i] = densities[2] * densities[2] * duration
+        walk = slack[WALK] if loose and i < LOOSE_BIASES else densities[2]
+        noise[i, i] = walk * walk * duration
     near = near_change_point(x)
     if near:
-        held = weak_is_held(x, covariance, constants)
-        _linearise_four(x, duration, densities, held, constants, transition, noise)
-        _move(x, wheel_torques, duration, held, constants, state)
+        held = weak_is_held(x, covariance, loose, constants)
+        mobility = _mobility(x, held, constants)
+        if held or not loose:
+            _linearise_four(mobility, 0.0, duration, densities, transition, noise)
+            _move(x, wheel_torques, duration, held, constants, state)
+        else:
+            lighten(x, mobility, constants, slack)
+            _linearise_four(mobility, slack[SHARED], duration, densities, transition, noise)
+            add_elasticity(
+                x, covariance, mobility, duration, constants, slack, transition, noise)
+            move_elastic(x, wheel_torques, duration, constants, slack, state)
     else:
+        if loose:
+            _linearise_lengths(x, wheel_torques, duration, constants, state, transition)
         _linearise_two(x, wheel_torques, duration, constants, state, transition)
         _noise_of_two(x, state, duration, densities, constants, noise)
     _carry(covariance, transition, noise, near)
@@ -106,33 +155,39 @@ def predict(x: Array, covariance: Array, suspicions: Array, wheel_torques: Array
         carry_suspicion(suspicions[n], transition, duration)
     x[0:8] = state[0:8]
     if near:
-        condition(x, covariance, suspicions, constants)
+        condition(x, covariance, suspicions, loose, constants)
 
 
 @kernel
-def meet(state: Array, covariance: Array, constants: Constants) -> None:
-    """Bring angles and rates that are close to the closure onto it, in place."""
-    if not close_reduced(state, constants):
+def meet(state: Array, covariance: Array, loose: bool, constants: Constants) -> None:
+    """
+    Bring angles and rates that are close to the closure onto it, in place.
+
+    :param loose: whether the loop may fail to close.
+    """
+    if loose and near_change_point(state) or not close_reduced(state, constants):
         angles, rates = project_onto_closure(
             (state[0], state[1], state[2], state[3]), (state[4], state[5], state[6], state[7]),
-            constants, weak_is_held(state, covariance, constants))
+            constants, weak_is_held(state, covariance, loose, constants))
         for j in range(4):
             state[j], state[4 + j] = angles[j], rates[j]
 
 
 @kernel
-def weak_is_held(x: Array, covariance: Array, constants: Constants) -> bool:
+def weak_is_held(x: Array, covariance: Array, loose: bool, constants: Constants) -> bool:
     """
     Tell whether the closure constrains its weak direction, as far as anybody knows.
 
     At a change point it does not, and within the uncertainty of the angles the linkage might be
-    at one.
+    at one. In a loop that may fail to close it does so where the links have leverage.
     """
     cosines, sines = directions((x[0], x[1], x[2], x[3]))
     factor, _ = factored_inertia(cosines, sines, (0.0, 0.0, 0.0, 0.0), constants)
     px, py = signed_links(cosines, sines, constants.lengths)
     strong, weak, c, s = orthogonal_columns(factor, px, py)
     size = dot(strong, strong)
+    if loose:
+        return dot(weak, weak) > RIGID_FROM * RIGID_FROM * size
     # How the weak column changes with the angles relative to link a, the strong one taken out.
     changes = np.zeros((4, 4))
     for i in range(1, 4):
@@ -152,11 +207,15 @@ def weak_is_held(x: Array, covariance: Array, constants: Constants) -> bool:
 
 
 @kernel
-def condition(x: Array, covariance: Array, suspicions: Array, constants: Constants) -> None:
+def condition(x: Array, covariance: Array, suspicions: Array, loose: bool, constants: Constants
+              ) -> None:
     """
     Take the closure and its rate as measured, in place: the covariance of what they allow.
 
-    What the closure bends within the covariance counts as noise of that measurement.
+    What the closure bends within the covariance counts as noise of that measurement. It tells
+    nothing of lengths, by whose error it may be off (S. F. Schmidt's consider states): a
+    measurement without noise, made again and again at angles that are estimates, would seem to
+    tell all of them. They follow from the sensors.
     """
     cosines, sines = directions((x[0], x[1], x[2], x[3]))
     factor, _ = factored_inertia(cosines, sines, (0.0, 0.0, 0.0, 0.0), constants)
@@ -164,9 +223,10 @@ def condition(x: Array, covariance: Array, suspicions: Array, constants: Constan
     _, _, c, s = orthogonal_columns(factor, px, py)
     length = constants.lengths[2]
     size = x.size
-    row, known = np.empty(8), np.empty(size)
+    concerned = LOOSE_BIASES if loose else 8
+    row, known = np.empty(concerned), np.empty(size)
     slopes = np.empty(4)
-    count = 4 if weak_is_held(x, covariance, constants) else 2
+    count = 4 if weak_is_held(x, covariance, loose, constants) else 2
     for n in range(count):
         p, q = (c, s) if n < 2 else (-s, c)
         of_rates = n % 2 == 1
@@ -178,7 +238,14 @@ def condition(x: Array, covariance: Array, suspicions: Array, constants: Constan
                 row[i], row[4 + i] = slopes[i] * x[4 + i], along
             else:
                 row[i] = along
-        floor = length * (STOPPED_TO if of_rates else CLOSED_TO)
+        if loose:
+            for i in range(1, 4):
+                grown = row[4 + i] * x[4 + i] if of_rates else -slopes[i]
+                row[9 + i] = grown / constants.lengths[i]
+        if loose:
+            floor = length * (GIVES_AT if of_rates else GIVES_TO)
+        else:
+            floor = length * (STOPPED_TO if of_rates else CLOSED_TO)
         variance = floor * floor
         for i in range(4):
             for k in range(4):
@@ -189,17 +256,18 @@ def condition(x: Array, covariance: Array, suspicions: Array, constants: Constan
                 variance += slopes[i] * slopes[k] * bent
         for i in range(size):
             known[i] = 0.0
-            for k in range(8):
+            for k in range(concerned):
                 known[i] += covariance[i, k] * row[k]
-        for k in range(8):
+        for k in range(concerned):
             variance += row[k] * known[k]
         for i in range(size):
             for k in range(size):
-                covariance[i, k] -= known[i] * known[k] / variance
+                if min(i, k) < 10 or max(i, k) >= concerned:
+                    covariance[i, k] -= known[i] * known[k] / variance
         for suspicion in suspicions:
             effect = suspicion[SCALARS:]
             seen = 0.0
-            for k in range(8):
+            for k in range(concerned):
                 seen += row[k] * effect[k]
             for i in range(size):
                 effect[i] -= known[i] * seen / variance
@@ -262,6 +330,32 @@ def _linearise_two(x: Array, wheel_torques: Array, duration: float, constants: C
 
 
 @kernel
+def _linearise_lengths(x: Array, wheel_torques: Array, duration: float, constants: Constants,
+                       state: Array, transition: Array) -> None:
+    """
+    Evaluate the transition of all links after the lengths of links b, c and d.
+
+    :param state: (STATE_SIZE,) to work in.
+    """
+    turned = turned_by_lengths(x, constants.lengths)
+    trial = np.empty(10)
+    for n in range(3):
+        width = DIFFERENCE * constants.lengths[1 + n]
+        for sign in (1.0, -1.0):
+            trial[:] = x[:10]
+            constants.lengths[1 + n] = x[10 + n] + sign * width
+            trial[2] += sign * width * turned[0, n]
+            trial[3] += sign * width * turned[1, n]
+            g = gamma_matrix(trial, constants.lengths)
+            trial[6] = g[0, 0] * trial[4] + g[0, 1] * trial[5]
+            trial[7] = g[1, 0] * trial[4] + g[1, 1] * trial[5]
+            _move(trial, wheel_torques, duration, True, constants, state)
+            for row in range(8):
+                transition[row, 10 + n] += 0.5 * sign / width * state[row]
+        constants.lengths[1 + n] = x[10 + n]
+
+
+@kernel
 def _noise_of_two(x: Array, end: Array, duration: float, densities: Array, constants: Constants,
                   noise: Array) -> None:
     """
@@ -311,24 +405,30 @@ def _noise_of_two(x: Array, end: Array, duration: float, densities: Array, const
 
 
 @kernel
-def _linearise_four(x: Array, duration: float, densities: Array, weak_held: bool,
-                    constants: Constants, transition: Array, noise: Array) -> None:
+def _linearise_four(mobility: Array, share: float, duration: float, densities: Array,
+                    transition: Array, noise: Array) -> None:
     """
     Evaluate transition and noise of all four links.
 
     That rates change with angles and rates is left out: over a step it is less than what the
     closure says afterwards.
+
+    :param mobility: (4, 4) accelerations per torque on each link [1/(kg m^2)].
+    :param share: of the disturbance torques of links a and b that acts on c and d.
     """
-    mobility = _mobility(x, weak_held, constants)
+    disturbed = np.empty((4, 2))
+    for i in range(4):
+        for k in range(2):
+            disturbed[i, k] = (1.0 - share) * mobility[i, k] + share * mobility[i, 2 + k]
     white, walk = densities[0] * densities[0], densities[1] * densities[1]
     t = duration
     for i in range(4):
         transition[i, i] = transition[4 + i, 4 + i] = 1.0
         transition[i, 4 + i] = t
         for k in range(2):
-            transition[i, 8 + k] = 0.5 * t * t * mobility[i, k]
-            transition[4 + i, 8 + k] = t * mobility[i, k]
-            cross = walk * mobility[i, k]
+            transition[i, 8 + k] = 0.5 * t * t * disturbed[i, k]
+            transition[4 + i, 8 + k] = t * disturbed[i, k]
+            cross = walk * disturbed[i, k]
             noise[i, 8 + k] = noise[8 + k, i] = cross * t ** 3 / 6.0
             noise[4 + i, 8 + k] = noise[8 + k, 4 + i] = cross * t ** 2 / 2.0
         for k in range(4):
@@ -336,7 +436,7 @@ def _linearise_four(x: Array, duration: float, densities: Array, weak_held: bool
             for m in range(4):
                 first += white * mobility[i, m] * mobility[k, m]
             for m in range(2):
-                second += walk * mobility[i, m] * mobility[k, m]
+                second += walk * disturbed[i, m] * disturbed[k, m]
             noise[i, k] = first * t ** 3 / 3.0 + second * t ** 5 / 20.0
             noise[i, 4 + k] = noise[4 + k, i] = first * t ** 2 / 2.0 + second * t ** 4 / 8.0
             noise[4 + i, 4 + k] = first * t + second * t ** 3 / 3.0

@@ -37,6 +37,8 @@ class EstimatorSettings:
     :param disturbance_torque: density of unknown torques on each link [N m/sqrt(Hz)].
     :param disturbance_walk: density of the random walk of the torques on links a and b that stand
         for friction and drag [N m/sqrt(s)].
+    :param closure_tolerance: how far the loop fails to close with the lengths that are given, as
+        a standard deviation [m]; 0 where these are exact.
     :param gate_probability: share of the samples of a healthy sensor that are used; the rest lies
         farther off than noise should have it.
     """
@@ -47,6 +49,7 @@ class EstimatorSettings:
     gyro_walk: float = 1e-4
     disturbance_torque: float = 1e-7
     disturbance_walk: float = 1e-7
+    closure_tolerance: float = 0.0
     gate_probability: float = 0.9999
 
     @property
@@ -68,4 +71,5 @@ class EstimatorSettings:
     @property
     def randomness(self) -> Randomness:
         """What acts on the linkage at random."""
-        return Randomness(self.disturbance_torque, self.disturbance_walk, self.gyro_walk)
+        return Randomness(self.disturbance_torque, self.disturbance_walk, self.gyro_walk,
+                          self.closure_tolerance)

@@ -83,7 +83,8 @@ def test_settings_that_were_used_are_told(bag, capsys):
     settings = json.loads(Path('new/comparison.json').read_text())['settings']
     assert settings == {'angle_noise': 0.004, 'counts_per_turn': 4096, 'gate_probability': 1.0,
                         'gyro_noise': 5e-3, 'gyro_walk': 1e-4,
-                        'disturbance_torque': 1e-7, 'disturbance_walk': 1e-7}
+                        'disturbance_torque': 1e-7, 'disturbance_walk': 1e-7,
+                        'closure_tolerance': 0.0}
 
 
 def test_parameters_file_of_the_nodes_does_too_and_options_come_first(bag):

@@ -28,7 +28,6 @@ from fourbar_ros.control.law import (
     Decision,
     HORIZON,
     motor_bounds,
-    SHARED_OUT,
     TrackingLaw,
 )
 from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism, reduced_form
@@ -226,7 +225,8 @@ def test_motors_can_give_what_lies_within_their_bounds(seed: int, name: str) -> 
     speeds = rng.uniform(-1.2, 1.2, 4) * limits
     friction = rng.uniform(-0.1, 0.1, 4) * mechanism.motor_torque_limits
     lower, upper = np.empty(4), np.empty(4)
-    motor_bounds(speeds, friction, boxed, lower, upper)
+    share = float(rng.uniform(0.5, 1.0))
+    motor_bounds(speeds, friction, share, boxed, lower, upper)
     assert (lower <= 0.0).all()
     assert (upper >= 0.0).all()
     for wheel in range(4):
@@ -239,10 +239,10 @@ def test_motors_can_give_what_lies_within_their_bounds(seed: int, name: str) -> 
             reached = speeds[wheel] + HORIZON * torque / inertias[wheel]
             assert abs(reached) <= max(limits[wheel], abs(speeds[wheel])) * (1.0 + 1e-12)
     # Far from both limits nothing but the share is kept back.
-    motor_bounds(np.zeros(4), NONE, boxed, lower, upper)
+    motor_bounds(np.zeros(4), NONE, share, boxed, lower, upper)
     largest = np.minimum(mechanism.motor_torque_limits, inertias / HORIZON * limits)
     np.testing.assert_allclose(upper, np.minimum(
-        SHARED_OUT * mechanism.motor_torque_limits, largest), rtol=1e-12)
+        share * mechanism.motor_torque_limits, largest), rtol=1e-12)
     np.testing.assert_allclose(lower, -upper, rtol=1e-12)
 
 
