@@ -164,7 +164,7 @@ def scenario_of(run: Run) -> Scenario:
     return replace(
         base, mechanism=mechanism, believed=believed, table=table,
         initial=InitialState(heading, heading + crossing.theta), controller=controller,
-        estimator=replace(base.estimator), setpoints=setpoints,
+        estimator=replace(base.estimator, closure_tolerance=tolerance), setpoints=setpoints,
         duration=crossing.duration, seed=run.seed)
 
 
