@@ -23,7 +23,7 @@ machine only ever adds to a time.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 import os
 from pathlib import Path
@@ -39,9 +39,10 @@ from fourbar_ros.analysis.independent import installed
 from fourbar_ros.analysis.independent.mujoco_model import MujocoLinkage, State, stiff
 from fourbar_ros.analysis.progress import Progress
 from fourbar_ros.configuration import share_directory
+from fourbar_ros.control import Controller
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.estimation.filter import LinkageFilter
-from fourbar_ros.loop.run import make_loop
+from fourbar_ros.loop.run import make_loop, run_scenario
 from fourbar_ros.loop.scenario import load_scenario
 from fourbar_ros.mechanism import assemble, compiled, load_mechanism, Mechanism
 from fourbar_ros.mechanism.case import Case, load_case
@@ -90,6 +91,11 @@ PLANT_TORQUE = 5e-3
 FILTER_STEPS = 200
 LOOP_TICKS = 50
 
+# The controller, with motors so weak [N m] that the shortest move takes all they have: so much of
+# it is timed [s], from the setpoint on.
+WEAK_MOTORS = 4e-3
+CONTROL_SECONDS = 2.0
+
 # The right-hand side runs on its own results, by so little that the motion stays: nothing of it
 # can be left out or done ahead.
 FEEDBACK = 1e-12
@@ -120,6 +126,8 @@ QUANTITIES = (
     ('plant_step_ns', 'ns', 'one step of the plant, every effect on'),
     ('plant_step_near_alignment_ns', 'ns', 'one step of the plant, near alignment'),
     ('estimator_step_ns', 'ns', 'one step of the filter, prediction and four gated angles'),
+    ('control_step_p50_us', 'us', 'one tick of the controller, median'),
+    ('control_step_p99_us', 'us', 'one tick of the controller, 99th percentile'),
     ('closed_loop_times_real_time', '', 'closed loop without ROS, times real time'),
     ('mujoco_euler_step_ns', 'ns', 'one step of MuJoCo, Euler'),
     ('mujoco_rk4_step_ns', 'ns', 'one step of MuJoCo, RK4'),
@@ -170,6 +178,19 @@ class Rival:
     count: int
 
 
+@dataclass(frozen=True, eq=False)
+class Takes:
+    """
+    What came of each turn of the controller, filled as it goes.
+
+    :param times: (n,) of every tick [ns].
+    :param active: share of the ticks at which the bounds of the motors were.
+    """
+
+    times: list[Array] = field(default_factory=list)
+    active: list[float] = field(default_factory=list)
+
+
 def measure(repeats: int, progress: Progress) -> dict[str, Any]:
     """
     Run the benchmark.
@@ -200,15 +221,23 @@ def measure(repeats: int, progress: Progress) -> dict[str, Any]:
     near = Stretch(load_mechanism('paper'), _near_alignment(), np.full(4, NEAR_TORQUE))
     results['smallest_sine'] = float(_sines(away, STEPS).min())
     results['near_alignment_largest_sine'] = float(_sines(near, NEAR_STEPS).max())
+    takes = Takes()
     rivals = {'rhs_ns': _right_hand_sides(away), 'rk4_step_ns': _steps(away, STEPS),
               'rk4_step_near_alignment_ns': _steps(near, NEAR_STEPS), 'batch': _batch(away),
               'plant_step_ns': _plant_steps(PLANT_AWAY),
               'plant_step_near_alignment_ns': _plant_steps(PLANT_NEAR),
-              'estimator_step_ns': _filter_steps(), 'loop': _loop_ticks()}
+              'estimator_step_ns': _filter_steps(), 'control': _control_ticks(takes),
+              'loop': _loop_ticks()}
     if with_mujoco:
         rivals |= _mujoco_rivals(away)
     results |= _race(rivals, stages)
     results['batch_steps_per_s'] = 1e9 / results.pop('batch')
+    del results['control']
+    for percent in (50, 99):
+        # The first round warms up.
+        results[f'control_step_p{percent}_us'] = min(
+            float(np.percentile(times, percent)) * 1e-3 for times in takes.times[1:])
+    results['control_bounds_active'] = min(takes.active)
     results['closed_loop_times_real_time'] = (
         load_scenario(SCENARIO).plant.period_ns / results.pop('loop'))
     if with_mujoco:
@@ -230,13 +259,16 @@ def checks_of(results: Mapping[str, Any]) -> list[Check]:
         at_most('plant_step_near_alignment_ns',
                 _number(results, 'plant_step_near_alignment_ns'), 'ns', 6000.0),
         at_most('estimator_step_ns', _number(results, 'estimator_step_ns'), 'ns', 60000.0),
+        at_most('control_step_p50_us', _number(results, 'control_step_p50_us'), 'us', 40.0),
+        at_most('control_step_p99_us', _number(results, 'control_step_p99_us'), 'us', 200.0),
         at_least('closed_loop_times_real_time',
                  _number(results, 'closed_loop_times_real_time'), '', 15.0),
         at_most('import_to_first_step_s', _number(results, 'import_to_first_step_s'), 's', 1.0),
         # That the stretches are what they are called.
         at_least('smallest_sine', _number(results, 'smallest_sine'), '', 0.5),
         at_most('near_alignment_largest_sine', _number(results, 'near_alignment_largest_sine'),
-                '', 0.1)]
+                '', 0.1),
+        at_least('control_bounds_active', _number(results, 'control_bounds_active'), '', 0.5)]
     if 'mujoco_euler_step_ns' in results:
         limits += [at_least('ratio_vs_mujoco_euler', _number(results, 'ratio_vs_mujoco_euler'),
                             '', 8.0),
@@ -428,6 +460,42 @@ def _filter_steps() -> Rival:
             linkage.correct((0, 1, 2, 3), linkage.angles, variances, settings.gate)
 
     return Rival(lambda: None, run, FILTER_STEPS)
+
+
+def _control_ticks(takes: Takes) -> Rival:
+    """Give the controller what it was given in a run of the closed loop, tick by tick."""
+    scenario = load_scenario(SCENARIO)
+    mechanism = replace(scenario.mechanism, motor_torque_limits=np.full(4, WEAK_MOTORS))
+    setpoint = scenario.setpoints[0]
+    scenario = replace(
+        scenario, mechanism=mechanism, believed=mechanism, duration=setpoint.at + CONTROL_SECONDS,
+        controller=replace(scenario.controller, allocation='bounded', command='velocity',
+                           setpoint_timing='shortest'))
+    given = [(step.samples.stamp_ns, step.estimate.link_angles, step.estimate.link_rates,
+              step.estimate.disturbance, step.samples.wheels.speeds, step.samples.wheels.efforts)
+             for step in run_scenario(scenario) if step.estimate is not None]
+    # Ticks after the setpoint, of which the estimator answers each.
+    count = scenario.ticks - 1 - scenario.tick_at(setpoint.at)
+    controllers: list[Controller] = []
+
+    def begin() -> None:
+        controller = Controller(mechanism, scenario.controller)
+        controller.device_armed(True)
+        for inputs in given[:-count]:
+            controller.tick(*inputs)
+        controller.setpoint(setpoint.names, setpoint.positions)
+        controllers[:] = [controller]
+
+    def run() -> None:
+        controller, times = controllers[0], np.empty(count)
+        for place, inputs in enumerate(given[-count:]):
+            begun = perf_counter_ns()
+            controller.tick(*inputs)
+            times[place] = perf_counter_ns() - begun
+        takes.times.append(times)
+        takes.active.append(controller.saturated / count)
+
+    return Rival(begin, run, count)
 
 
 def _loop_ticks() -> Rival:

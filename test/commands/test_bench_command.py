@@ -28,7 +28,8 @@ needs_mujoco = pytest.mark.skipif(find_spec('mujoco') is None, reason='mujoco is
 
 OURS = ('rhs_ns', 'rk4_step_ns', 'rk4_step_near_alignment_ns', 'batch_steps_per_s', 'error_rad',
         'import_to_first_step_s', 'plant_step_ns', 'plant_step_near_alignment_ns',
-        'closed_loop_times_real_time', 'estimator_step_ns')
+        'closed_loop_times_real_time', 'estimator_step_ns', 'control_step_p50_us',
+        'control_step_p99_us', 'control_bounds_active')
 BESIDE_MUJOCO = (
     'mujoco_euler_step_ns', 'mujoco_rk4_step_ns', 'mujoco_euler_lean_step_ns',
     'mujoco_rk4_lean_step_ns', 'ratio_vs_mujoco_euler', 'ratio_vs_mujoco_rk4',
@@ -43,6 +44,7 @@ GOOD = {
     'mujoco_rk4_step_ns': 20000.0, 'ratio_vs_mujoco_euler': 12.5, 'ratio_vs_mujoco_rk4': 50.0,
     'plant_step_ns': 2000.0, 'plant_step_near_alignment_ns': 4000.0,
     'closed_loop_times_real_time': 30.0, 'estimator_step_ns': 2e4,
+    'control_step_p50_us': 20.0, 'control_step_p99_us': 50.0, 'control_bounds_active': 0.7,
     'cores': 2, 'cpu': 'a quick one',
     'load_average_1min': 0.0, 'versions': {'python': '3'},
     'linkage': 'asymmetric', 'step_s': 1e-3, 'torque_sampling': 'held', 'statistic': 'least',
@@ -82,6 +84,9 @@ def test_every_number_is_there(measured: tuple[int, dict[str, Any]]) -> None:
 def test_stretches_are_what_they_are_called(measured: tuple[int, dict[str, Any]]) -> None:
     document = measured[1]
     assert document['near_alignment_largest_sine'] < 0.1 < 0.5 < document['smallest_sine']
+    # The motors are at their bounds at many ticks, and not at all of them.
+    assert 0.5 < document['control_bounds_active'] < 0.95
+    assert document['control_step_p50_us'] <= document['control_step_p99_us']
 
 
 def test_our_motion_is_exact(measured: tuple[int, dict[str, Any]]) -> None:
@@ -132,6 +137,9 @@ def test_without_mujoco_the_rest_is_measured(
     ({'plant_step_near_alignment_ns': 6001.0}, 1),
     ({'closed_loop_times_real_time': 14.9}, 1),
     ({'estimator_step_ns': 60001.0}, 1),
+    ({'control_step_p50_us': 40.1}, 1),
+    ({'control_step_p99_us': 200.1}, 1),
+    ({'control_bounds_active': 0.49}, 1),
     ({'ratio_vs_mujoco_euler': 7.9}, 1),
     ({'ratio_vs_mujoco_rk4': 29.9}, 1),
     ({'near_alignment_largest_sine': 0.2}, 1),

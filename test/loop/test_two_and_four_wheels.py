@@ -28,8 +28,8 @@ Recorded = dict[str, NDArray[np.float64]]
 
 # Of the soft step, the largest rate times duration over distance.
 PEAK_RATE = 15.0 / 8.0
-# Ticks miss the peak by at most 2 ms, 3e-7 of it, and torque that is held for 4 ms is late by 2 ms,
-# which feedback makes good: 2e-4 of a turn of 10 s at most.
+# Ticks miss the peak by at most 2 ms, 3e-7 of it. Torque that is held for 4 ms is late by 2 ms,
+# 2e-4 of the 10 s, and feedback makes good for that.
 CLOSE = 1e-3
 
 

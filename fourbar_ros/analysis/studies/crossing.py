@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Can four wheels do at a change point what two cannot? The paper's claim for redundancy, with limits.
+Can four wheels do at a change point what two cannot? The paper's claim for redundancy, and where.
 
 At theta = 0 a rhombus may leave on another branch. Four wheels hold it on its branch by opposite
 torques, fed back from eta = phi_c - phi_a; two wheels cannot. Three manoeuvres of the prototype on

@@ -22,7 +22,7 @@ device still armed and nothing refused.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import pi, radians
+from math import inf, pi, radians
 
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.loop import load_scenario, Scenario, ScriptedSetpoint
@@ -109,27 +109,29 @@ class Passage:
 def go(run: Run) -> Passage:
     """Make a run; whatever goes wrong is a failure of it."""
     scenario = scenario_of(run)
-    loop = make_loop(scenario)
     angles, torque = [], 0.0
     reason = ''
     try:
+        loop = make_loop(scenario)
         for step in run_scenario(scenario, loop):
             truth = step.samples.truth
             assert truth is not None
             angles.append(truth.link_angles)
             torque = max(torque, float(np.abs(truth.efforts).max()))
+        if not loop.testbed.gate.armed:
+            reason = loop.testbed.gate.reason
     except FourbarError as failure:
         reason = str(failure)
-    way = np.array(angles)
+    way = np.reshape(angles, (-1, 4))
     eta = wrap_angles(way[:, 2] - way[:, 0])
     goal = np.array([scenario.setpoints[-1].positions] * 2).ravel()
-    error = float(np.abs(wrap_angles(way[-1] - goal)).max())
-    if not reason and not loop.testbed.gate.armed:
-        reason = loop.testbed.gate.reason
-    if not reason and error > NEAR_GOAL:
+    error = float(np.abs(wrap_angles(way[-1] - goal)).max()) if len(way) else inf
+    # Written so that NaN fails.
+    if not reason and not error <= NEAR_GOAL:
         reason = 'elsewhere'
     path = np.column_stack([way[:, 1] - way[:, 0], eta])[::PATH_EVERY]
-    return Passage(not reason, error, float(np.abs(eta).max()), torque, reason, path)
+    return Passage(
+        not reason, error, float(np.abs(eta).max(initial=0.0)), torque, reason, path)
 
 
 def scenario_of(run: Run) -> Scenario:
