@@ -473,8 +473,9 @@ class Controller:
         move.at(0.5)
         # Not by `check_needs`: not every linkage closes with all angles the same.
         times = move.instants(2)
-        wheel_loads(times, np.tile(square, (2, 1)), move.sample(times)[:, 1:],
-                    self._guide.parallel, self.law.mobilities, np.array([self.mechanism.constants]))
+        wheel_loads(
+            times, np.tile(square, (2, 1)), move.sample(times)[:, 1:], self._guide.parallel,
+            self.law.mobilities, np.array([self.mechanism.constants]))
 
 
 def _bearings_of(settings: ControllerSettings) -> Array:
