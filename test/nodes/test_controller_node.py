@@ -42,7 +42,7 @@ WRONG = {
     'too few': (['link_a', 'link_b'], [([0.1], 5.0, {})], '2 names but 1'),
     'back in time': (['link_a'], [([0.1], 5.0, {}), ([0.2], 4.0, {})], 'time'),
     'torques': (['link_a'], [([0.1], 5.0, {'effort': [1.0]})], 'effort'),
-    'in motion at the end': (['link_a'], [([0.1], 5.0, {'velocities': [1.0]})], 'rest'),
+    'in motion at the end': (['link_a'], [([0.1], 5.0, {'velocities': [1.0]})], 'must be 0'),
     'too fast': (['link_a', 'link_b'], [([pi, pi], 1.0, {})], 'needs '),
     'through a change point': (['link_a', 'link_b'], [([0.0, 0.0], 20.0, {})], 'change point'),
 }
