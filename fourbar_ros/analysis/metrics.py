@@ -81,9 +81,9 @@ MEANINGS = {
         'J', 'Mechanical work of the motors, the integral of |torque times relative speed|, '
         'accumulated since the setpoint.'),
     'energy.copper_loss_j': Meaning(
-        'J', 'Heat in the windings of the motors, the integral of resistance times current squared '
-        'as the controller works it out, accumulated since the setpoint; 0 for motors whose '
-        'windings are not described.'),
+        'J', 'Heat in the windings of the motors, the integral of resistance times current '
+        'squared as the controller works it out, accumulated since the setpoint; 0 for motors '
+        'whose windings are not described.'),
     'loop.rate_hz': Meaning('Hz', 'Ticks per second of stamp time since the setpoint.'),
     'loop.ticks': Meaning('1', 'Ticks since the setpoint.'),
     'loop.round_trip_p50_ms': Meaning(

@@ -343,7 +343,7 @@ class _Run:
         self.ticks_ns.append(stamp_ns)
         for message in messages:
             if message.topic == STATES:
-                angles, rates = (values.tolist() for values in message.values)
+                angles, rates = (values.tolist() for values in message.values[:2])
                 self.replayed.states.add(stamp_ns, message.names, angles, rates)
             elif message.topic == INNOVATION:
                 self.replayed.nis.add(stamp_ns, message.names, message.values[0].tolist())

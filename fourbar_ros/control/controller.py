@@ -61,6 +61,9 @@ TO_STICK, TO_SLIDE = 0.3, 0.05
 # A period that differs by more than this share from that for which gains were checked is new.
 SAME_PERIOD = 0.05
 
+# So many periods in a row of more than one tick are a slower loop, and no losses.
+LOST_IN_A_ROW = 10
+
 ALL = np.ones(4, dtype=bool)
 
 
@@ -131,6 +134,7 @@ class Controller:
         self._last: Control | None = None
         self._period = 0.0
         self._checked_period = 0.0
+        self._lost = 0
         self._gain_problem = ''
         self._bearings = _bearings_of(settings)
         self.law.tune(settings, ALL)
@@ -195,6 +199,7 @@ class Controller:
         :param stamp_ns: when it was given, 0 for now [ns].
         :raises SetpointError: it is refused whole, and nothing changes; also counted.
         """
+        was = self.mode
         try:
             goals = check_names(names, positions)
             self._check_driving()
@@ -211,7 +216,7 @@ class Controller:
                             self._wheels_after(step.duration), share=self.law.share,
                             crossing=crossing)
         except SetpointError as error:
-            self._refuse(error)
+            self._refuse(error, was)
             raise
         self._accept(step, goal)
 
@@ -225,6 +230,7 @@ class Controller:
         :param stamp_ns: when it shall start, 0 for now [ns].
         :raises SetpointError: it is refused whole, and nothing changes; also counted.
         """
+        was = self.mode
         try:
             self._check_driving()
             self._check_stamp(stamp_ns)
@@ -236,7 +242,7 @@ class Controller:
             check_needs(self.mechanism, way, guide.angles, self._wheels_after(way.duration),
                         share=self.law.share, crossing=crossing)
         except SetpointError as error:
-            self._refuse(error)
+            self._refuse(error, was)
             raise
         self._accept(way, goal)
 
@@ -302,17 +308,20 @@ class Controller:
         if not 0.0 < period <= 1.0:
             return 0.0
         self._period = period
-        if not self._checked_period or (
-                abs(period - self._checked_period) > SAME_PERIOD * self._checked_period):
-            # A tick that got lost makes a period of twice the length, and no new rate.
-            whole = round(period / self._checked_period) if self._checked_period else 0
-            if whole < 2 or abs(period - whole * self._checked_period) > SAME_PERIOD * period:
-                self._checked_period = period
-                try:
-                    check_gains(self.settings, self.mechanism, period)
-                    self._gain_problem = ''
-                except GainError as error:
-                    self._gain_problem = str(error)
+        known = self._checked_period
+        whole = round(period / known) if known else 0
+        # A tick that got lost makes a period of twice the length, and no new rate.
+        if whole and abs(period - whole * known) <= SAME_PERIOD * period:
+            self._lost = 0 if whole == 1 else self._lost + 1
+        else:
+            self._lost = LOST_IN_A_ROW
+        if self._lost >= LOST_IN_A_ROW:
+            self._checked_period, self._lost = period, 0
+            try:
+                check_gains(self.settings, self.mechanism, period)
+                self._gain_problem = ''
+            except GainError as error:
+                self._gain_problem = str(error)
         return period if period <= LONGEST_PERIOD else 0.0
 
     def _change_mode(self) -> None:
@@ -435,7 +444,11 @@ class Controller:
         self.mode, self.problem = 'track', ''
         self.accepted += 1
 
-    def _refuse(self, error: SetpointError) -> None:
+    def _refuse(self, error: SetpointError, was: str) -> None:
+        if self.mode != was:
+            # It goes on to damp.
+            self.mode = was
+            self._guide.stand_at(self.angles)
         self.refused += 1
         self.last_refusal = str(error)
 
@@ -475,8 +488,9 @@ class Controller:
         move.at(0.5)
         # Not by `check_needs`: not every linkage closes with all angles the same.
         times = move.instants(2)
-        wheel_loads(times, np.tile(square, (2, 1)), move.sample(times)[:, 1:],
-                    self._guide.parallel, self.law.mobilities, np.array([self.mechanism.constants]))
+        wheel_loads(
+            times, np.tile(square, (2, 1)), move.sample(times)[:, 1:], self._guide.parallel,
+            self.law.mobilities, np.array([self.mechanism.constants]))
 
 
 def _bearings_of(settings: ControllerSettings) -> Array:

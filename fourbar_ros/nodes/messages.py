@@ -96,12 +96,12 @@ class JointStatePublisher:
         :param names: instead of those given before, for messages that leave some out.
         :param fields: likewise; the others are empty.
         """
-        if fields is not None and fields != self._fields:
+        names = self._names if names is None else names
+        if fields not in (None, self._fields):
             for field in self._fields:
                 setattr(self._message, field, [])
-            self._fields = fields
-            self._set_names(self._names if names is None else names)
-        if names is not None and names != self._names:
+            self._fields, self._names = fields, None
+        if names != self._names:
             self._set_names(names)
         stamp = self._message.header.stamp
         stamp.sec, stamp.nanosec = divmod(stamp_ns, 1_000_000_000)

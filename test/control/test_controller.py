@@ -29,7 +29,7 @@ from fourbar_ros.control import (
 )
 from fourbar_ros.control.accounts import COPPER, EQ9, FLYWHEEL_ENERGY, WORK
 from fourbar_ros.control.allocation import AllocationError
-from fourbar_ros.control.controller import NO_HOLD
+from fourbar_ros.control.controller import LOST_IN_A_ROW, NO_HOLD
 from fourbar_ros.control.guide import STOPPING_TIME
 from fourbar_ros.control.law import SHARED_OUT
 from fourbar_ros.mechanism import assemble, kinetic_energy, Mechanism
@@ -499,6 +499,28 @@ def test_setpoint_while_damping_starts_from_the_links_as_they_move(act: str, mov
     np.testing.assert_allclose(moving.plant.truth().link_angles[:2], goal, atol=1e-4)
 
 
+@pytest.mark.parametrize('act', ['setpoint', 'trajectory'])
+def test_refusal_while_damping_changes_nothing(act: str, steer: Drive, prototype: Mechanism
+                                               ) -> None:
+    """The next commands are those of a controller that was not asked."""
+    alone, bothered = (steer(prototype, setpoint_duration=4.0) for _ in range(2))
+    for steered in (alone, bothered):
+        STEPS['track'](steered)
+        steered.ticks(400)
+        steered.controller.damp()
+        steered.ticks(3)
+    controller = bothered.controller
+    with pytest.raises(SetpointError):
+        if act == 'setpoint':
+            controller.setpoint(['link_b'], [0.0])
+        else:
+            controller.trajectory(['link_b'], [Point([0.0], 4.0)])
+    assert (controller.mode, controller.goal, controller.refused) == ('damp', None, 1)
+    for first, second in zip(alone.ticks(20), bothered.ticks(20)):
+        np.testing.assert_array_equal(first.command.values, second.command.values)
+        np.testing.assert_array_equal(first.reference_angles, second.reference_angles)
+
+
 def test_repeated_tick_answers_the_same(moving: Any) -> None:
     """A lock-step sends it again when its answer was lost, perhaps with other numbers."""
     control = moving.tick()
@@ -630,6 +652,28 @@ def test_rate_that_falls_makes_it_idle(paper: Mechanism) -> None:
     stamp += PERIOD_NS
     controller.tick(stamp, angles, NONE, QUIET, NONE, NONE)
     assert (controller.mode, controller.problem) == ('hold', '')
+
+
+@pytest.mark.parametrize('times', [5, 13])
+def test_rate_that_falls_to_a_whole_fraction_is_noticed_too(times: int, paper: Mechanism) -> None:
+    """Not at once, when it might be lost ticks; and some lost every now and then are no rate."""
+    settings = ControllerSettings(**UNSTABLE)  # type: ignore[arg-type]
+    controller = Controller(paper, settings)
+    controller.device_armed(True)
+    angles, stamp = assemble(paper, 0.0, 1.0), 10 ** 9
+
+    def tick(periods: int) -> str:
+        nonlocal stamp
+        stamp += periods * PERIOD_NS
+        controller.tick(stamp, angles, NONE, QUIET, NONE, NONE)
+        return controller.mode
+    for _ in range(3):
+        tick(1)
+    for _ in range(50):
+        assert tick(1) == tick(times) == 'hold'
+    modes = [tick(times) for _ in range(LOST_IN_A_ROW)]
+    assert modes == ['hold'] * (LOST_IN_A_ROW - 2) + ['idle'] * 2
+    assert f'not stable at {250.0 / times:.4g} Hz' in controller.problem
 
 
 # What is asked for

@@ -284,7 +284,7 @@ def moving(suite, make_probe):
     verdict = watcher.setpoint_verdict(
         JointState(name=['link_a', 'link_b'], position=[0.6, 1.7]),
         watcher.publisher(JointState, 'setpoint'))
-    assert verdict['accepted'] == '1'
+    assert verdict['accepted'] == '1', verdict['last_refusal']
     watcher.wait(lambda: spinning(watcher, 5.0))
     return nodes, watcher
 

@@ -42,7 +42,7 @@ JOINT_STATES = {
             'disturbance_spin_n_m_s', 'unaccounted_spin_n_m_s', 'contacts'], ('position',)),
     },
     'estimator': {
-        'estimate/link_states': (LINKS, ANGLE_AND_RATE),
+        'estimate/link_states': (LINKS, ALL),
         'estimate/sigma': (LINKS, ANGLE_AND_RATE),
         'estimate/covariance': ([
             'phi_a.phi_a', 'phi_a.phi_b', 'phi_a.omega_a', 'phi_a.omega_b', 'phi_b.phi_b',
@@ -56,7 +56,14 @@ JOINT_STATES = {
         'flywheel_command': (WHEELS, ('effort',)),
         'reference': (LINKS, ANGLE_AND_RATE),
         'tracking_error': (LINKS, ANGLE_AND_RATE),
-        'energy': (['flywheel_energy_j', 'eq9_j_s', 'work_j'], ('position',)),
+        'energy': (['flywheel_energy_j', 'eq9_j_s', 'work_j', 'copper_loss_j'], ('position',)),
+        'allocation': (
+            ['scale', 'condition_number', 'branch_hold', *(
+                form.format(link) for form in (
+                    'saturated_{}', 'verdict_{}', 'null_speed_{}_rad_s') for link in 'abcd')],
+            ('position',)),
+        'momentum': (['total_n_m_s', 'axis_a_n_m_s', 'axis_b_n_m_s', 'margin', 'time_left_s'],
+                     ('position',)),
     },
 }
 TOPICS = {topic: form for topics in JOINT_STATES.values() for topic, form in topics.items()}
@@ -67,7 +74,7 @@ SUBSCRIPTIONS = {
     'plant': {'flywheel_command': True, 'emergency_stop_request': True},
     'estimator': {'link_angles': False, 'flywheel_states': False},
     'controller': {'flywheel_states': False, 'estimate/link_states': True, 'setpoint': True,
-                   'device_status': True},
+                   'trajectory': True, 'device_status': True},
 }
 SERVICES = {
     'plant': {'/sim/pause': 'std_srvs/srv/SetBool', '/sim/step': 'std_srvs/srv/Trigger',
@@ -75,7 +82,8 @@ SERVICES = {
               '/emergency_stop': 'std_srvs/srv/Trigger',
               '/reset_emergency_stop': 'std_srvs/srv/Trigger'},
     'estimator': {'/estimate/reset': 'std_srvs/srv/Trigger'},
-    'controller': {},
+    'controller': {'/enable': 'std_srvs/srv/SetBool', '/hold': 'std_srvs/srv/Trigger',
+                   '/damp': 'std_srvs/srv/Trigger'},
 }
 JOINT_STATE, STATUS = 'sensor_msgs/msg/JointState', 'diagnostic_msgs/msg/DiagnosticStatus'
 # What every node of rclpy has.
@@ -126,7 +134,8 @@ def test_node_publishes_just_its_topics(testbed, name):
 @each_node
 def test_node_subscribes_to_just_its_topics(testbed, name):
     found = types_by_name(testbed.node.get_subscriber_names_and_types_by_node(name, '/'))
-    special = {'/device_status': STATUS, '/emergency_stop_request': 'std_msgs/msg/Bool'}
+    special = {'/device_status': STATUS, '/emergency_stop_request': 'std_msgs/msg/Bool',
+               '/trajectory': 'trajectory_msgs/msg/JointTrajectory'}
     assert found == {f'/{topic}': special.get(f'/{topic}', JOINT_STATE)
                      for topic in SUBSCRIPTIONS[name]}
 
@@ -170,8 +179,9 @@ def test_subscribers_ask_for_no_more_than_they_need(testbed, name):
 def test_names_are_in_their_order_and_unused_arrays_empty(testbed, topic):
     names, fields = TOPICS[topic]
     for message in testbed.more(topic, 50):
-        # A tick that nobody answered has no round trip: what was not measured is left out.
-        unmeasured = {'round_trip_s'} - set(message.name)
+        # A tick that nobody answered has no round trip, wheels that do not drift no time to
+        # their limit: what was not measured is left out.
+        unmeasured = {'round_trip_s', 'time_left_s'} - set(message.name)
         assert message.name == [name for name in names if name not in unmeasured]
         for field in ALL:
             length = len(message.name) if field in fields else 0
@@ -241,8 +251,9 @@ def test_statuses_have_their_keys(testbed):
     assert device['state'] == 'disarmed'
     assert device['mechanism'] == 'paper'
     controller = testbed.status('controller_status')
-    assert {'mode', 'goal', 'last_refusal'} < set(controller)
+    assert {'mode', 'goal', 'last_refusal', 'problem', 'wheel_faults'} < set(controller)
     assert (controller['mode'], controller['goal']) == ('disarmed', '')
+    assert (controller['problem'], controller['wheel_faults']) == ('', '')
 
 
 def test_late_joiner_gets_both_statuses(testbed, make_probe):

@@ -26,14 +26,16 @@ pytestmark = pytest.mark.node
 
 # Ticks before the device is armed, between that and the setpoint, and after it.
 BEFORE, BETWEEN, AFTER = 40, 10, 300
+COMMANDS = {'paper': 'effort', 'prototype': 'velocity'}
 GOAL = {'link_a': 0.3, 'link_b': 1.5}
 TOPICS = {
     'link_angles': ('position',), 'flywheel_states': ('position', 'velocity', 'effort'),
     'sim/link_states': ('position', 'velocity'),
     'sim/flywheel_states': ('position', 'velocity', 'effort'),
-    'estimate/link_states': ('position', 'velocity'), 'estimate/sigma': ('position', 'velocity'),
+    'estimate/link_states': ('position', 'velocity', 'effort'),
+    'estimate/sigma': ('position', 'velocity'),
     'reference': ('position', 'velocity'), 'tracking_error': ('position', 'velocity'),
-    'flywheel_command': ('effort',), 'energy': ('position',)}
+    'flywheel_command': ('effort', 'velocity'), 'energy': ('position',)}
 
 
 def stamp_of(message):
@@ -108,4 +110,6 @@ def test_every_sample_is_the_same(suite, make_probe, preset):
             for row, message in zip(expected[f'{topic}.{field}'], found[topic]):
                 given = row[~np.isnan(row)]
                 assert given.tolist() == list(getattr(message, field)), (topic, field)
-    assert np.abs(expected['flywheel_command.effort']).max() > 0.0
+    # The presets differ in what they tell the wheels.
+    assert np.nanmax(np.abs(expected[f'flywheel_command.{COMMANDS[preset]}'])) > 0.0
+    assert bool(found['flywheel_command'][-1].velocity) == (preset == 'prototype')

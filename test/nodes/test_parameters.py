@@ -176,8 +176,9 @@ def test_bandwidth_acts_at_once(testbed):
     At the same errors the wheels get torque in proportion to the law's gains.
 
     At rest the law is `torque ~ w^2 angle_error + 2 d w rate_error`: the torque that the errors
-    explain best tells w.
+    explain best tells w. What is estimated of disturbances would come on top of it.
     """
+    assert set_value(testbed, 'controller', 'disturbance_compensation', 0.0) == (True, '')
     testbed.wait(lambda: testbed.arm().success)
     testbed.status('controller_status', mode='hold')
 
