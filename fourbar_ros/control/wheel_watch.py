@@ -48,8 +48,8 @@ HEALTHY, DEGRADED, DEAD, STUCK, RUNAWAY, SHORTED = range(len(VERDICTS))
 # is broken or degraded.
 UNFOLLOWED = 2.5
 UNFOLLOWED_TICKS = 4
-# So much more is allowed [rad/s] of a motor that was strained so lately [s]: what its own loop does
-# in the limit is known less well.
+# So much more is allowed [rad/s] of a motor that was strained so lately [s]: what its own loop
+# does in the limit is known less well.
 OF_STRAINED, JUST_STRAINED = 10.0, 0.3
 
 # Time constants of means [s]: for a wheel that breaks, and for one that degrades; with which a
@@ -57,8 +57,10 @@ OF_STRAINED, JUST_STRAINED = 10.0, 0.3
 # errors of the friction add up there.
 SHORT, LONG, SLOW, VERY_SLOW = 0.02, 0.5, 5.0, 30.0
 
-# In shares of the motor's torque limit: degradation is looked at from this effort on; torque that
+# In shares of the motor's torque limit, or of so many times its friction if that is more:
+# degradation is looked at from this effort on; torque that
 # friction takes; a motor that gives nothing; one that gives what nobody asked for; a brake.
+FRICTIONS = 50.0
 LOOKED_AT, FRICTION_LOSS, NOTHING, UNASKED, BRAKED = 0.04, 8e-4, 2e-3, 0.04, 0.1
 
 # Shares of the expected torque: that of a dead motor at most, and what a healthy one may lack; of
@@ -69,11 +71,11 @@ MISSING_BY_SPEED, REPLICA_SLOW = 0.25, 5.0
 
 # A wheel that follows speeds is late if it is so far behind on the mean [rad/s]; one that follows
 # torques, if some delay explains its effort better than none by this factor, in squares, and the
-# difference is more than this share of the limit.
+# difference is more than this share, as above.
 BEHIND, EXPLAINED_BETTER, VISIBLE = 0.35, 4.0, 5e-4
 
-# Degradation must last so long to be said [s], and is not looked at while the motor gives more than
-# this share of its limit, nor for so long afterwards [s].
+# Degradation must last so long to be said [s], and is not looked at while the motor gives more
+# than this share of its limit, nor for so long afterwards [s].
 PERSISTENT, STRAINED, AFTER_STRAIN = 0.5, 0.5, 2.0
 
 # The friction of slower wheels is not known [rad/s], nor that of one which was slow so lately [s].
@@ -183,6 +185,7 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
     for j in range(4):
         wheel, before = kept[j], verdicts[j]
         inertia, limit = motors.inertia[j], motors.torque_limit[j]
+        scale = max(limit, FRICTIONS * friction[0])
         speed, turned = speeds[j], rates[j] - wheel[LAST_RATE]
         gained = speed - wheel[LAST_SPEED]
         gain = inertia * (gained + turned) / period
@@ -193,8 +196,8 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
             _without_power(wheel, speed, period)
             if verdicts[j] == RUNAWAY and wheel[CUT_FOR] > CUT_WITHIN:
                 # Friction brakes it: anything else is driven.
-                if (abs(speed) > SLOWEST and copysign(1.0, speed) * wheel[GAIN] > UNASKED * limit
-                        or abs(wheel[EFFORT]) > UNASKED * limit):
+                if (abs(speed) > SLOWEST and copysign(1.0, speed) * wheel[GAIN] > UNASKED * scale
+                        or abs(wheel[EFFORT]) > UNASKED * scale):
                     verdicts[j] = SHORTED
             changed |= verdicts[j] != before
             continue
@@ -208,7 +211,7 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
         allowed = UNFOLLOWED + (OF_STRAINED if wheel[SETTLED] < JUST_STRAINED else 0.0)
         wheel[AGAINST] = wheel[AGAINST] + 1.0 if abs(behind) > allowed else 0.0
         if wheel[AGAINST] >= UNFOLLOWED_TICKS:
-            verdicts[j] = max(before, _broken(wheel, speed, limit, friction))
+            verdicts[j] = max(before, _broken(wheel, speed, scale, friction))
             wheel[MODEL_SPEED], wheel[AGAINST] = speed, 0.0
         if verdicts[j] == HEALTHY and _degraded(
                 j, wheel, asked, by_speed, speed, behind, efforts[j], gain, commands[j], period,
@@ -263,21 +266,21 @@ def _follow_model(j: int, wheel: Array, command: float, by_speed: bool, speed: f
 
 
 @kernel
-def _broken(wheel: Array, speed: float, limit: float, friction: Array) -> int:
+def _broken(wheel: Array, speed: float, scale: float, friction: Array) -> int:
     """Tell what is the matter with a wheel that does not follow."""
     effort, expected = wheel[EFFORT], wheel[EXPECTED]
-    nothing = NOTHING * limit
+    nothing = NOTHING * scale
     if (abs(effort) < DEAD_SHARE * abs(expected) + nothing
             and abs(effort - expected) > 2.0 * nothing):
         return DEAD
     taken = copysign(friction[0], speed) + friction[1] * speed if abs(speed) > STANDING else 0.0
     lost = effort - taken - wheel[GAIN]
     dry = friction[0]
-    if abs(lost) > max(5.0 * dry, BRAKED * limit) or (
+    if abs(lost) > max(5.0 * dry, BRAKED * scale) or (
             abs(speed) < STANDING and abs(effort) > 3.0 * dry + nothing
             and abs(lost) > 0.5 * abs(effort)):
         return STUCK
-    unasked = abs(effort - expected) > UNASKED * limit + 0.5 * abs(expected)
+    unasked = abs(effort - expected) > UNASKED * scale + 0.5 * abs(expected)
     if unasked and (effort * expected < 0.0 or abs(effort) > 1.3 * abs(expected)):
         return RUNAWAY
     return DEGRADED
@@ -286,10 +289,11 @@ def _broken(wheel: Array, speed: float, limit: float, friction: Array) -> int:
 @kernel
 def _degraded(j: int, wheel: Array, asked: float, by_speed: bool, speed: float, behind: float,
               effort: float, gain: float, command: float, period: float, long: float,
-              gained: float, friction: Array, boxed: NDArray[np.record], past: Array, late: Array) -> bool:
+              gained: float, friction: Array, boxed: NDArray[np.record], past: Array,
+              late: Array) -> bool:
     """Tell whether a wheel lacks torque or acts late, for long enough to say so."""
     motors = boxed[0]
-    limit = motors.torque_limit[j]
+    scale = max(motors.torque_limit[j], FRICTIONS * friction[0])
     if by_speed:
         seen = speed - 0.5 * gained * LOOP_STEP / period
         asked = _replicate(j, wheel, command, seen, effort, period, boxed)
@@ -314,15 +318,15 @@ def _degraded(j: int, wheel: Array, asked: float, by_speed: bool, speed: float, 
         wheel[LOST] += share * (lost - wheel[LOST])
     missing = abs(wheel[LONG_EXPECTED] - wheel[LONG_EFFORT]) > (
         (MISSING_BY_SPEED if by_speed else MISSING) * abs(wheel[LONG_EXPECTED])
-        + NOTHING * limit)
+        + NOTHING * scale)
     if by_speed:
         tardy = abs(wheel[LONG_BEHIND]) > BEHIND
     else:
-        tardy = late[0] > max(EXPLAINED_BETTER * best, (VISIBLE * limit) ** 2)
+        tardy = late[0] > max(EXPLAINED_BETTER * best, (VISIBLE * scale) ** 2)
     rubbing = (friction[0] > 0.0 and wheel[FAST_FOR] > AFTER_SLOW
-               and _rubs(wheel, speed, limit, period))
+               and _rubs(wheel, speed, scale, period))
     # A share of little is no evidence.
-    missing &= max(abs(wheel[LONG_EFFORT]), abs(wheel[LONG_EXPECTED])) > LOOKED_AT * limit
+    missing &= max(abs(wheel[LONG_EFFORT]), abs(wheel[LONG_EXPECTED])) > LOOKED_AT * scale
     if wheel[SETTLED] > AFTER_STRAIN and (missing or tardy or rubbing):
         wheel[SUSPECT_FOR] += period
     else:
@@ -331,12 +335,12 @@ def _degraded(j: int, wheel: Array, asked: float, by_speed: bool, speed: float, 
 
 
 @kernel
-def _rubs(wheel: Array, speed: float, limit: float, period: float) -> bool:
+def _rubs(wheel: Array, speed: float, scale: float, period: float) -> bool:
     """Tell whether friction takes more than it used to, and learn what it is used to."""
     accelerated = wheel[LONG_GAIN] * copysign(1.0, speed)
     if wheel[KNOWN] == 0.0:
         wheel[LEARNT], wheel[LEARNT_GAIN], wheel[KNOWN] = wheel[LOST], accelerated, 1.0
-    allowed = FRICTION_LOSS * limit + INERTIA_ERROR * abs(accelerated - wheel[LEARNT_GAIN])
+    allowed = FRICTION_LOSS * scale + INERTIA_ERROR * abs(accelerated - wheel[LEARNT_GAIN])
     if wheel[LOST] - wheel[LEARNT] > allowed:
         return True
     # What is about to be too much is not learnt as usual.

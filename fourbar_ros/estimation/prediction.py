@@ -76,9 +76,9 @@ HELD_FROM = 9.0
 CLOSED_TO = 1e-8
 STOPPED_TO = 1e-6
 
-# The same for a loop that may fail to close, whose joints give a little in every direction. What is
-# known of the direction of the line has a part in what the closure tells there; if that was without
-# noise, again and again, the direction along the line would seem to be known, too.
+# The same for a loop that may fail to close, whose joints give a little in every direction. What
+# is known of the direction of the line has a part in what the closure tells there; if that was
+# without noise, again and again, the direction along the line would seem to be known, too.
 GIVES_TO = 1e-5
 GIVES_AT = 1e-3
 

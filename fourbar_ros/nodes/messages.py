@@ -93,8 +93,7 @@ class JointStatePublisher:
         Send one message.
 
         :param values: an array for each field.
-        :param names: instead of those given before, for messages that leave some out.
-        :param fields: likewise; the others are empty.
+        :param names, fields: instead of those given before; other fields are empty.
         """
         names = self._names if names is None else names
         if fields not in (None, self._fields):

@@ -230,7 +230,7 @@ def test_saturation_scales_all_wheels_together(uneven: Mechanism) -> None:
     limits = np.array([2e-5, 3e-6, 1e-5, 5e-5])
     free, wanted = pushed(replace(uneven, motor_torque_limits=np.full(4, np.inf)), angles, rates)
     limited, torques = pushed(replace(uneven, motor_torque_limits=limits), angles, rates)
-    limits *= SHARED_OUT
+    limits *= SHARED_OUT['effort']
     excess = (np.abs(wanted) / limits).max()
     assert excess > 1.5
     np.testing.assert_allclose(torques, wanted / excess, rtol=1e-14)

@@ -20,6 +20,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fourbar_ros.control import Controller, ControllerSettings
+from fourbar_ros.control.law import SHARED_OUT
 from fourbar_ros.control.scalars import (
     ALLOCATION,
     allocation_scalars,
@@ -122,7 +123,8 @@ def test_scale_and_saturated_wheels(uneven: Mechanism) -> None:
     # All in proportion: just the one that is at its bound limits them.
     assert sum(at_bound) == 1.0
     wheel = at_bound.index(1.0)
-    assert abs(decided.torques[wheel]) == pytest.approx(0.95e-4, rel=1e-6)
+    assert abs(decided.torques[wheel]) == pytest.approx(
+        SHARED_OUT['effort'] * 1e-4, rel=1e-6)
     assert found['branch_hold'] == 0.0
     form = reduced_form(uneven, assemble(uneven, 0.8, 1.2), NONE)
     assert found['condition_number'] == pytest.approx(np.linalg.cond(form.mass_matrix), rel=1e-9)

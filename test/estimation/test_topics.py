@@ -71,7 +71,8 @@ def test_everything_of_an_estimate_is_said(topics: EstimatorTopics, paper: Mecha
         assert len(message.values) == len(OUTPUTS[topic].fields)
         assert all(len(values) == len(message.names) for values in message.values)
     assert np.array_equal(said['estimate/link_states'].values,
-                          [estimate.link_angles, estimate.link_rates])
+                          [estimate.link_angles, estimate.link_rates,
+                           [*estimate.disturbance, 0.0, 0.0]])
     assert np.array_equal(said['estimate/sigma'].values,
                           [estimate.angle_sigmas, estimate.rate_sigmas])
     innovation = estimate.innovation

@@ -83,9 +83,9 @@ def test_joint_encoders_and_one_heading_serve_as_well(heading: str) -> None:
 def strong_scenario() -> Scenario:
     """Give the linkage of the paper motors that bear moves within half a second."""
     scenario = load_scenario('paper')
-    return replace(scenario, mechanism=replace(
-        scenario.mechanism, motor_torque_limits=np.full(4, 1e-2),
-        motor_speed_limits=np.full(4, 5e4)))
+    strong = replace(scenario.mechanism, motor_torque_limits=np.full(4, 1e-2),
+                     motor_speed_limits=np.full(4, 5e4))
+    return replace(scenario, mechanism=strong, believed=strong)
 
 
 def test_script_acts_from_the_next_tick_on() -> None:
