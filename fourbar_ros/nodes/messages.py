@@ -83,10 +83,10 @@ class JointStatePublisher:
     def _set_names(self, names):
         self._names = names
         self._message.name = list(names)
-        self._views = []
-        for field in self._fields:
-            setattr(self._message, field, [0.0] * len(names))
-            self._views.append(np.frombuffer(getattr(self._message, field)))
+        for field in ('position', 'velocity', 'effort'):
+            used = field in self._fields
+            setattr(self._message, field, [0.0] * len(names) if used else [])
+        self._views = [np.frombuffer(getattr(self._message, field)) for field in self._fields]
 
     def publish(self, stamp_ns, *values, names=None, fields=None):
         """
@@ -96,11 +96,9 @@ class JointStatePublisher:
         :param names, fields: instead of those given before; other fields are empty.
         """
         names = self._names if names is None else names
-        if fields not in (None, self._fields):
-            for field in self._fields:
-                setattr(self._message, field, [])
-            self._fields, self._names = fields, None
-        if names != self._names:
+        fields = self._fields if fields is None else fields
+        if names != self._names or fields != self._fields:
+            self._fields = fields
             self._set_names(names)
         stamp = self._message.header.stamp
         stamp.sec, stamp.nanosec = divmod(stamp_ns, 1_000_000_000)

@@ -201,7 +201,8 @@ def closed_loop_messages(scenario, namespace=''):
         if (estimate := step.estimate) is None:
             continue
         add('estimate/link_states', joint_state(
-            stamp, LINKS, estimate.link_angles, estimate.link_rates))
+            stamp, LINKS, estimate.link_angles, estimate.link_rates,
+            [*estimate.disturbance, 0.0, 0.0]))
         add('estimate/sigma', joint_state(
             stamp, LINKS, estimate.angle_sigmas, estimate.rate_sigmas))
         count = len(estimate.covariance)

@@ -94,20 +94,23 @@ def test_momenta_are_those_of_the_whole_and_of_the_axes(
     assert found['margin'] == pytest.approx(1.0 - np.abs(speeds).max() / 500.0, rel=1e-12)
 
 
-def test_momentum_moves_between_axes_only_by_what_is_applied(steer: Steer, prototype: Mechanism
-                                                             ) -> None:
-    """Free of friction the pairs of a rhombus keep theirs, each for itself, whatever is done."""
+def test_pairs_of_a_rhombus_keep_their_momentum(steer: Steer, prototype: Mechanism) -> None:
+    """Free of friction each for itself, whatever the wheels do; encoders tell half a tick late."""
     steered = steer(prototype, InitialState(), setpoint_duration=2.0)
     steered.controller.setpoint(['link_a', 'link_b'], [0.4, 1.2])
-    traded = 0.0
+    held = largest = 0.0
     for _ in range(600):
-        steered.tick()
+        torques = steered.tick().torques
+        largest = max(largest, np.abs(torques).max())
         found = momentum_of(steered.controller)
-        traded = max(traded, np.abs(
-            prototype.flywheel_inertias * steered.plant.truth().wheel_speeds).max())
-        for name in ('total_n_m_s', 'axis_a_n_m_s', 'axis_b_n_m_s'):
-            assert abs(found[name]) < 1e-9 * traded + 1e-15
-    assert traded > 1e-3
+        # Between two ticks motors come to their torque and links change theirs: a little more.
+        late = 1.05 * 0.5 * 4e-3 * largest
+        assert abs(found['axis_a_n_m_s']) <= 2.0 * late + 1e-12
+        assert abs(found['axis_b_n_m_s']) <= 2.0 * late + 1e-12
+        assert abs(found['total_n_m_s']) <= 4.0 * late + 1e-12
+        held = max(held, 2.0 * prototype.flywheel_inertias[0] * np.abs(
+            steered.plant.truth().wheel_speeds).max())
+    assert held > 50.0 * 2.0 * late
 
 
 def test_scale_and_saturated_wheels(uneven: Mechanism) -> None:

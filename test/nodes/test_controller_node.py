@@ -43,7 +43,7 @@ WRONG = {
     'back in time': (['link_a'], [([0.1], 5.0, {}), ([0.2], 4.0, {})], 'time'),
     'torques': (['link_a'], [([0.1], 5.0, {'effort': [1.0]})], 'effort'),
     'in motion at the end': (['link_a'], [([0.1], 5.0, {'velocities': [1.0]})], 'must be 0'),
-    'too fast': (['link_a', 'link_b'], [([pi, pi], 1.0, {})], 'needs '),
+    'too fast': (['link_a', 'link_b'], [([2.0, 2.0 + pi / 3], 1.0, {})], 'needs '),
     'through a change point': (['link_a', 'link_b'], [([0.0, 0.0], 20.0, {})], 'change point'),
 }
 
