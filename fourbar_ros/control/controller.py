@@ -64,6 +64,9 @@ SAME_PERIOD = 0.05
 # So many periods in a row of more than one tick are a slower loop, and no losses.
 LOST_IN_A_ROW = 10
 
+# Of what the law may share out, a plan may use so much; the rest is for errors.
+PLANNED = 0.9
+
 ALL = np.ones(4, dtype=bool)
 
 
@@ -213,8 +216,7 @@ class Controller:
                 step = self._shortest(step)
             else:
                 check_needs(self.mechanism, step, guide.angles,
-                            self._wheels_after(step.duration), share=self.law.share,
-                            crossing=crossing)
+                            self._wheels_after(step.duration), crossing=crossing)
         except SetpointError as error:
             self._refuse(error, was)
             raise
@@ -240,7 +242,7 @@ class Controller:
                 self.mechanism, names, points, guide.motion.copy(), guide.angles,
                 guide.destination, crossing=crossing)
             check_needs(self.mechanism, way, guide.angles, self._wheels_after(way.duration),
-                        share=self.law.share, crossing=crossing)
+                        crossing=crossing)
         except SetpointError as error:
             self._refuse(error, was)
             raise
@@ -386,7 +388,7 @@ class Controller:
         try:
             shortest = shortest_duration(
                 self.mechanism, guide.motion.copy(), goal[:2], guide.angles,
-                self._wheels_after(0.0), share=self.law.share, crossing=self._crossing)
+                self._wheels_after(0.0), crossing=self._crossing)
             if shortest > left:
                 move = SoftStep(guide.motion.copy(), goal[:2], shortest)
                 follow(self.mechanism, move, guide.angles, crossing=self._crossing)
@@ -412,13 +414,13 @@ class Controller:
         speeds = self.speeds + self.momentum.drift * min(duration, 60.0) * (
             np.sign(self.momentum.drift) == np.sign(self.speeds))
         friction = np.full(4, self.settings.bearing_coulomb)
-        return Wheels(speeds, metric, friction)
+        return Wheels(speeds, metric, friction, PLANNED * self.law.share)
 
     def _shortest(self, move: SoftStep) -> SoftStep:
         guide = self._guide
         duration = shortest_duration(
             self.mechanism, move.start, move.goal, guide.angles, self._wheels_after(0.0),
-            share=self.law.share, crossing=self._crossing)
+            crossing=self._crossing)
         shortest = SoftStep(move.start, move.goal, duration)
         follow(self.mechanism, shortest, guide.angles, crossing=self._crossing)
         return shortest

@@ -79,11 +79,14 @@ class Wheels:
         that cannot be used. Flywheel inertias squared make it the least wheel accelerations.
     :param extra_torque: (4,) friction that the motor of a wheel that turns has to overcome besides
         [N m].
+    :param torque_share: of torques and voltages that a plan may use, None for as much as of the
+        speeds.
     """
 
     speeds: Array
     mobilities: Array
     extra_torque: Array = field(default_factory=lambda: np.zeros(4))
+    torque_share: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,12 +229,14 @@ def _worst(mechanism: Mechanism, needs: Needs, wheels: Wheels, share: float
         return inf, (f'{", ".join(usable) or "no flywheel"} can be used, which leaves '
                      f'{100.0 * needs.unmet:.3g} % of the torque needed unmet')
     worst, problem = 0.0, ''
-    for needed, limits, now, unit, word in (
-            (needs.peak_speeds, mechanism.motor_speed_limits, np.abs(wheels.speeds), 'rad/s',
+    of_torque = share if wheels.torque_share is None else wheels.torque_share
+    for needed, limits, share, now, unit, word in (
+            (needs.peak_speeds, mechanism.motor_speed_limits, share, np.abs(wheels.speeds),
+             'rad/s', 'motor'),
+            (needs.peak_torques, mechanism.motor_torque_limits, of_torque, np.zeros(4), 'N m',
              'motor'),
-            (needs.peak_torques, mechanism.motor_torque_limits, np.zeros(4), 'N m', 'motor'),
-            (needs.peak_voltages, mechanism.motor_voltages, _holding_voltages(mechanism, wheels),
-             'V', 'supply')):
+            (needs.peak_voltages, mechanism.motor_voltages, of_torque,
+             _holding_voltages(mechanism, wheels), 'V', 'supply')):
         ratios = np.nan_to_num(needed / np.maximum(share * limits, now), nan=inf)
         wheel = int(np.argmax(ratios))
         if ratios[wheel] > worst:

@@ -14,11 +14,9 @@
 
 """What a motion needs of the wheels is what the plant takes, and limits are told with numbers."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from math import pi
 import re
-from time import perf_counter
 
 from fourbar_ros.control.feasibility import (
     check_needs,
@@ -381,21 +379,3 @@ def test_way_that_cannot_close_is_refused() -> None:
     way = step(0.0, 1.0, 0.0, 1.5, 10.0)
     with pytest.raises(SetpointError, match='on the way there the loop cannot close'):
         needs_of(long, way, present_at(long, way), fresh(long))
-
-
-@pytest.mark.parametrize(('work', 'limit_s'), [('needs', 2e-3), ('shortest', 50e-3)])
-def test_it_is_done_between_two_ticks(work: str, limit_s: float, uneven: Mechanism) -> None:
-    """The best of some, since others use the machine as well."""
-    way = step(0.2, 1.5, 0.9, 1.2, 3.0)
-    present, wheels = present_at(uneven, way), fresh(uneven)
-    moving = way.start + [[0.0, 0.0], [0.1, 0.1], [0.0, 0.0]]
-    doing: dict[str, Callable[[], object]] = {
-        'needs': lambda: needs_of(uneven, way, present, wheels),
-        'shortest': lambda: shortest_duration(uneven, moving, way.goal, present, wheels)}
-    doing[work]()
-    took = []
-    for _ in range(5):
-        began = perf_counter()
-        doing[work]()
-        took.append(perf_counter() - began)
-    assert min(took) < limit_s
