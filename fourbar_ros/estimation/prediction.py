@@ -76,9 +76,9 @@ HELD_FROM = 9.0
 CLOSED_TO = 1e-8
 STOPPED_TO = 1e-6
 
-# The same for a loop that may fail to close, whose joints give a little in every direction. What
-# is known of the direction of the line has a part in what the closure tells there; if that was
-# without noise, again and again, the direction along the line would seem to be known, too.
+# The same across the line for a loop that may fail to close, whose joints give a little in every
+# direction. Where the line is follows from angles that are estimates: without noise, again and
+# again, the closure across it would seem to tell that along it, too.
 GIVES_TO = 1e-5
 GIVES_AT = 1e-3
 
