@@ -230,19 +230,19 @@ def _worst(mechanism: Mechanism, needs: Needs, wheels: Wheels, share: float
                      f'{100.0 * needs.unmet:.3g} % of the torque needed unmet')
     worst, problem = 0.0, ''
     of_torque = share if wheels.torque_share is None else wheels.torque_share
-    for needed, limits, share, now, unit, word in (
+    for needed, limits, part, now, unit, word in (
             (needs.peak_speeds, mechanism.motor_speed_limits, share, np.abs(wheels.speeds),
              'rad/s', 'motor'),
             (needs.peak_torques, mechanism.motor_torque_limits, of_torque, np.zeros(4), 'N m',
              'motor'),
             (needs.peak_voltages, mechanism.motor_voltages, of_torque,
              _holding_voltages(mechanism, wheels), 'V', 'supply')):
-        ratios = np.nan_to_num(needed / np.maximum(share * limits, now), nan=inf)
+        ratios = np.nan_to_num(needed / np.maximum(part * limits, now), nan=inf)
         wheel = int(np.argmax(ratios))
         if ratios[wheel] > worst:
             worst = float(ratios[wheel])
-            limit = share * limits[wheel]
-            of_what = f"{100.0 * share:g} % of the {word}'s {limits[wheel]:.4g} {unit}"
+            limit = part * limits[wheel]
+            of_what = f"{100.0 * part:g} % of the {word}'s {limits[wheel]:.4g} {unit}"
             if now[wheel] > limit:
                 limit, of_what = now[wheel], f'what it is now, above {of_what}'
             problem = (f'needs {needed[wheel]:.4g} {unit} on {FLYWHEEL_NAMES[wheel]}, limit '

@@ -51,6 +51,9 @@ UNFOLLOWED_TICKS = 4
 # So much more is allowed [rad/s] of a motor that was strained so lately [s]: what its own loop
 # does in the limit is known less well.
 OF_STRAINED, JUST_STRAINED = 10.0, 0.3
+# And of a slow wheel that is driven by torque, which static friction holds back more [rad/s]; its
+# model is led back sooner [s].
+OF_SLOW, SOON = 1.5, 2.0
 
 # Time constants of means [s]: for a wheel that breaks, and for one that degrades; with which a
 # healthy one is learnt, and the model of a wheel that is driven by torque led back to it, since
@@ -209,6 +212,8 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
         if max(abs(wheel[EFFORT]), abs(wheel[EXPECTED])) > STRAINED * limit:
             wheel[SETTLED] = 0.0
         allowed = UNFOLLOWED + (OF_STRAINED if wheel[SETTLED] < JUST_STRAINED else 0.0)
+        if not by_speed and abs(speed) < SLOWEST:
+            allowed += OF_SLOW
         wheel[AGAINST] = wheel[AGAINST] + 1.0 if abs(behind) > allowed else 0.0
         if wheel[AGAINST] >= UNFOLLOWED_TICKS:
             verdicts[j] = max(before, _broken(wheel, speed, scale, friction))
@@ -260,7 +265,7 @@ def _follow_model(j: int, wheel: Array, command: float, by_speed: bool, speed: f
         model = after
     behind = speed - mean_speed
     if not by_speed:
-        model += behind * period / SLOW
+        model += behind * period / (SLOW if abs(speed) > SLOWEST else SOON)
     wheel[MODEL_SPEED], wheel[MODEL_TORQUE] = model, torque
     return total, behind
 
