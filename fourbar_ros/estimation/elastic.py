@@ -47,10 +47,10 @@ import numpy as np
 
 # What the filter is told of a loop that may fail to close: density of the walk of lengths
 # [m/sqrt(s)], stiffness [N/m] and damping [N s/m] of the joints in series, by what mass the links
-# are lighter to them than with all the gap in joint 3 [kg], density of white torques that turn
-# opposite links apart [N m/sqrt(Hz)], and which share of a disturbance torque acts on the
-# opposite link.
-WALK, STIFFNESS, DAMPING, LIGHTER, APART, SHARED = range(6)
+# are lighter to them than with all the gap in joint 3 [kg], how well their pull is known, relative
+# to it, density of white torques that turn opposite links apart [N m/sqrt(Hz)], and which share of
+# a disturbance torque acts on the opposite link.
+WALK, STIFFNESS, DAMPING, LIGHTER, KNOWN_TO, APART, SHARED = range(7)
 
 # Ratio of the singular values of the constraints from which on both are rigid: a parallelogram
 # near alignment stays below it, but on the folded branch the links have leverage.
@@ -60,9 +60,7 @@ RIGID_FROM = 0.4
 # stiff. A step turns the motion by at most one radian.
 FASTEST = 200.0
 
-# How well the pull of the joints is known, relative to it: springs in series do not move their
-# masses as fast as one spring without; and the slowest motion that counts for that [rad/s].
-PULL_KNOWN_TO = 0.2
+# Slowest motion that counts for how long an error of the joints' pull lasts [rad/s].
 SLOWEST = 10.0
 
 # What remains at least of an inertia of one that is made lighter.
@@ -238,7 +236,7 @@ def add_elasticity(x: Array, covariance: Array, mobility: Array, duration: float
     pull = stiffness * r + slack[DAMPING] * dot(slopes, (x[4], x[5], x[6], x[7]))
     # For as long as a radian of the motion takes the error stays the same.
     lasts = 1.0 / max(sqrt(stiffness * dot(slopes, pulled)), SLOWEST)
-    variance = PULL_KNOWN_TO * PULL_KNOWN_TO * pull * pull
+    variance = slack[KNOWN_TO] * slack[KNOWN_TO] * pull * pull
     for i in range(4):
         for k in range(4):
             bent = 0.5 * covariance[i, k] * covariance[i, k]

@@ -76,6 +76,11 @@ WALKED_BEFORE = 10.0
 LENGTH_WALK = 0.01
 APART_FOR = 0.3
 
+# How well the pull of joints that give is known, relative to it: stiffness is hardly known better,
+# and what mass centres beside the lines of their links do is left out. Of joints that are said to
+# be rigid nothing is known but that they pull.
+PULL_KNOWN_TO = 0.2
+
 Snapshot = tuple[Array, Array, Array, tuple[int, ...]]
 
 
@@ -131,16 +136,16 @@ def _slack(mechanism: Mechanism, randomness: Randomness) -> Array:
     """Return what the kernels are told of a loop that may fail to close, see elastic."""
     if not randomness.closure:
         return np.zeros(0)
-    stiffness, damping, lighter = inf, 0.0, 0.0
+    stiffness, damping, lighter, known_to = inf, 0.0, 0.0, 1.0
     if np.isfinite(mechanism.joint_stiffness).all():
         stiffness = 1.0 / float((1.0 / mechanism.joint_stiffness).sum())
         # At one pull in all of them, each joint has this share of the gap.
         shares = stiffness / mechanism.joint_stiffness
         damping = float(mechanism.joint_damping @ shares ** 2)
-        lighter = _lighter(mechanism, shares)
+        lighter, known_to = _lighter(mechanism, shares), PULL_KNOWN_TO
     lengths = mechanism.link_lengths
     parallel = np.abs(lengths[:2] - lengths[2:]).max() <= randomness.closure
-    return np.array([LENGTH_WALK * randomness.closure, stiffness, damping, lighter,
+    return np.array([LENGTH_WALK * randomness.closure, stiffness, damping, lighter, known_to,
                      APART_FOR * randomness.torque_walk, 0.5 if parallel else 0.0])
 
 

@@ -172,6 +172,20 @@ def test_turning_off_at_a_change_point(seed: int, aligned: float, miss: tuple[fl
 
 
 @pytest.mark.parametrize('seed', SEEDS)
+def test_joints_that_give_though_the_file_calls_them_rigid(seed: int, rigid: Mechanism,
+                                                           compliant: Mechanism) -> None:
+    """The estimate is worse, but the sensors are believed, and not the joints."""
+    world = World(missing(compliant, 1e-4, 0.0, 0.0, 0.0), -0.4, 0.2)
+    estimator = Estimator(rigid, SETTINGS)
+    estimates, _ = watch(world, estimator, 2.7, seed)
+    assert estimator.starts == 1, f'seed {seed}'
+    assert estimator.sensor_faults() == {}, f'seed {seed}'
+    # No worse than a few samples make it.
+    errors = wrap_angles(estimates[-1].link_angles - world.angles)
+    assert np.abs(errors).max() < 2.0 * NOISE, f'seed {seed}'
+
+
+@pytest.mark.parametrize('seed', SEEDS)
 @pytest.mark.parametrize(('theta', 'rate', 'seconds'), [(-0.4, 0.2, 4.0), (-0.06, 0.02, 6.0)])
 def test_rigid_joints(seed: int, theta: float, rate: float, seconds: float, rigid: Mechanism
                       ) -> None:
