@@ -37,6 +37,7 @@ from fourbar_ros.control.axes import (
     NO_HOLD,
     TERMS,
 )
+from fourbar_ros.control.branch import LINKS_ALONE
 from fourbar_ros.mechanism import assemble, kinetic_energy, Mechanism, reduced_form
 import numpy as np
 from numpy.typing import NDArray
@@ -68,11 +69,12 @@ class Axes:
 
 
 def axes_at(mechanism: Mechanism, angles: Array, rates: Array, parallel: bool,
-            reference_angles: Array | None = None, reference_rates: Array = NONE) -> Axes:
+            reference_angles: Array | None = None, reference_rates: Array = NONE,
+            twins: NDArray[np.int64] = LINKS_ALONE) -> Axes:
     found = Axes(*(np.full(shape, np.nan) for shape in ((3, 4), (2, 2), 3, TERMS)))
     axes_of(angles, rates, angles if reference_angles is None else reference_angles,
-            reference_rates, parallel, np.array([mechanism.constants]), found.rows, found.errors,
-            found.bias, found.terms)
+            reference_rates, parallel, twins, np.array([mechanism.constants]), found.rows,
+            found.errors, found.bias, found.terms)
     return found
 
 

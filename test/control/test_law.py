@@ -23,6 +23,7 @@ from math import pi
 from fourbar_ros.control import ControllerSettings
 from fourbar_ros.control.allocation import AllocationError, ALLOCATIONS
 from fourbar_ros.control.axes import BRANCH_A, BRANCH_B, HOLD, NO_HOLD
+from fourbar_ros.control.branch import PARALLELOGRAM
 from fourbar_ros.control.guide import Guide
 from fourbar_ros.control.law import (
     Decision,
@@ -188,7 +189,7 @@ def test_torques_change_without_a_corner_where_the_hold_fades(
         for theta in np.linspace(0.02, np.arcsin(NO_HOLD) + 0.1, count):
             angles = np.array([0.0, theta, 0.0, theta])
             guide = guide_at(mechanism, angles + [0.01, -0.02, 0.005, 0.01], NONE, NONE)
-            guide.parallel = True
+            guide.branch = PARALLELOGRAM
             torques.append(decide(law, guide, angles, NONE,
                                   speeds=np.array([50.0, -20.0, 10.0, 80.0])).torques.copy())
         return float(np.abs(np.diff(torques, 2, axis=0)).max())
