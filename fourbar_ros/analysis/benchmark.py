@@ -93,7 +93,7 @@ LOOP_TICKS = 50
 
 # The controller, with motors so weak [N m] that the shortest move takes all they have: so much of
 # it is timed [s], from the setpoint on.
-WEAK_MOTORS = 4e-3
+WEAK_MOTORS = 3e-3
 CONTROL_SECONDS = 2.0
 
 # The right-hand side runs on its own results, by so little that the motion stays: nothing of it

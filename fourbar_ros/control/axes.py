@@ -15,10 +15,10 @@
 """
 Computed torque: what the links need for an acceleration, and on which axes.
 
-The axes are links a and b, which c and d follow. Where opposite links are parallel they are the
-pairs, a with c and b with d, and there is a third axis: at a change point the links of a pair may
-turn apart, `eta = omega_c - omega_a` (docs/mechanics.md). Nothing is divided by what vanishes
-there.
+The axes are links a and b, which c and d follow. Where links turn in pairs they are the pairs, on
+the parallelogram a with c and b with d, and there is a third axis: at a change point the links of
+a pair may turn apart, `eta = omega_c - omega_a` (docs/mechanics.md). Nothing is divided by what
+vanishes there. Which links are twins is given as (4,): P1, Q1, P2, Q2 for the pairs P and Q.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from fourbar_ros.mechanism.forces import Four
 import numpy as np
 from numpy.typing import NDArray
 
-# The hold on the branch is full up to this |sin(phi_b - phi_a)|, and beyond the second there is
-# none: the closure holds it.
+# The hold on the branch is full up to this |sin theta|, theta between the pairs, and beyond the
+# second there is none: the closure holds it.
 FULL_HOLD = 0.15
 NO_HOLD = 0.35
 
@@ -45,23 +45,26 @@ TERMS = 10
 
 
 @kernel
-def pair_terms(angles: Array, rates: Four, constants: Constants
+def pair_terms(angles: Array, rates: Four, twins: NDArray[np.int64], constants: Constants
                ) -> tuple[Array, Four, float, float, float, float, float]:
     """
-    Evaluate paper eq. 6 on the pairs, a with c and b with d.
+    Evaluate paper eq. 6 on the pairs, on the parallelogram a with c and b with d.
 
     `A = T^T M T` and `b = T^T h`, `M` and `h` those of the four link angles: the axes turn with
     the pairs, so T is constant.
 
     :param angles: (4,) of the links [rad].
     :param rates: of the four links [rad/s].
+    :param twins: (4,) links P1, Q1, P2, Q2 of the pairs.
     :returns: M (4, 4) [kg m^2], h [N m]; A00, A01, A11 [kg m^2], b0, b1 [N m].
     """
     m = mass_matrix(angles, constants)
     cosines, sines = directions((angles[0], angles[1], angles[2], angles[3]))
     _, h = factored_inertia(cosines, sines, rates, constants)
-    return (m, h, m[0, 0] + 2.0 * m[0, 2] + m[2, 2], m[0, 1] + m[0, 3] + m[2, 1] + m[2, 3],
-            m[1, 1] + 2.0 * m[1, 3] + m[3, 3], h[0] + h[2], h[1] + h[3])
+    p1, q1, p2, q2 = twins[0], twins[1], twins[2], twins[3]
+    return (m, h, m[p1, p1] + 2.0 * m[p1, p2] + m[p2, p2],
+            m[p1, q1] + m[p1, q2] + m[p2, q1] + m[p2, q2],
+            m[q1, q1] + 2.0 * m[q1, q2] + m[q2, q2], h[p1] + h[p2], h[q1] + h[q2])
 
 
 @kernel
@@ -74,16 +77,17 @@ def hold_on_branch(theta: float) -> float:
 
 @kernel
 def axes_of(angles: Array, rates: Array, reference_angles: Array, reference_rates: Array,
-            parallel: bool, boxed: NDArray[np.record], rows: Array, errors: Array, bias: Array,
-            terms: Array) -> None:
+            paired: bool, twins: NDArray[np.int64], boxed: NDArray[np.record], rows: Array,
+            errors: Array, bias: Array, terms: Array) -> None:
     """
     Evaluate paper eq. 6 and the tracking errors on the axes.
 
     :param angles, rates: (4,) of the links, estimated [rad], [rad/s].
     :param reference_angles, reference_rates: (4,) likewise.
-    :param parallel: whether opposite links are parallel, or meant to be.
+    :param paired: whether links turn in pairs, or are meant to.
+    :param twins: (4,) links P1, Q1, P2, Q2 of the pairs.
     :param boxed: (1,) constants of the mechanism.
-    :param rows: (3, 4) receives G, and the row of eta where opposite links are parallel.
+    :param rows: (3, 4) receives G, and the row of eta where links turn in pairs.
     :param errors: (2, 2) receives reference minus estimate, angles [rad] and rates [rad/s].
     :param bias: (3,) receives b, and that of eta [N m].
     :param terms: (TERMS,) receives A, and what is known of eta: how its inertia is coupled to the
@@ -91,9 +95,9 @@ def axes_of(angles: Array, rates: Array, reference_angles: Array, reference_rate
         much it is to be held; and cond(A).
     """
     constants = boxed[0]
-    if parallel:
-        _parallel_axes(angles, rates, reference_angles, reference_rates, boxed, rows, errors,
-                       bias, terms)
+    if paired:
+        _pair_axes(angles, rates, reference_angles, reference_rates, twins, boxed, rows, errors,
+                   bias, terms)
     else:
         a00, a01, a11, b0, b1, g1, g2, g3, g4, _, _ = reduced_terms_at(angles, rates, constants)
         rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3] = 1.0, 0.0, g1, g3
@@ -112,19 +116,21 @@ def axes_of(angles: Array, rates: Array, reference_angles: Array, reference_rate
 
 
 @kernel
-def _parallel_axes(angles: Array, rates: Array, reference_angles: Array, reference_rates: Array,
-                   boxed: NDArray[np.record], rows: Array, errors: Array, bias: Array,
-                   terms: Array) -> None:
+def _pair_axes(angles: Array, rates: Array, reference_angles: Array, reference_rates: Array,
+               twins: NDArray[np.int64], boxed: NDArray[np.record], rows: Array, errors: Array,
+               bias: Array, terms: Array) -> None:
     constants = boxed[0]
-    theta = 0.5 * (angles[1] + angles[3] - angles[0] - angles[2])
-    sign = 1.0 if cos(theta) >= 0.0 else -1.0
-    # In line, the closure leaves free what turns c and d apart from a and b by inverse lengths.
-    gearing = sign * constants.lengths[0] / constants.lengths[1]
+    p1, q1, p2, q2 = twins[0], twins[1], twins[2], twins[3]
+    theta = 0.5 * (angles[q1] + angles[q2] - angles[p1] - angles[p2])
+    # Not of the mean: where one twin is a turn ahead, that is half a turn off.
+    sign = 1.0 if cos(angles[q1] - angles[p1]) >= 0.0 else -1.0
+    # In line, the closure leaves free what turns twins apart, by inverse lengths.
+    gearing = sign * constants.lengths[p1] / constants.lengths[q1]
     rows[:] = 0.0
-    rows[0, 0] = rows[0, 2] = rows[1, 1] = rows[1, 3] = 1.0
-    rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3] = -0.5, -0.5 * gearing, 0.5, 0.5 * gearing
+    rows[0, p1] = rows[0, p2] = rows[1, q1] = rows[1, q2] = 1.0
+    rows[2, p1], rows[2, q1], rows[2, p2], rows[2, q2] = -0.5, -0.5 * gearing, 0.5, 0.5 * gearing
     matrix, h, terms[A00], terms[A01], terms[A11], bias[0], bias[1] = pair_terms(
-        angles, (rates[0], rates[1], rates[2], rates[3]), constants)
+        angles, (rates[0], rates[1], rates[2], rates[3]), twins, constants)
     bias[2] = rows[2, 0] * h[0] + rows[2, 1] * h[1] + rows[2, 2] * h[2] + rows[2, 3] * h[3]
     for row in range(3):
         coupled = 0.0
@@ -140,10 +146,11 @@ def _parallel_axes(angles: Array, rates: Array, reference_angles: Array, referen
     size = 0.5 * (1.0 + gearing * gearing)
     terms[BRANCH_ANGLE], terms[BRANCH_RATE] = angle / size, rate / size
     for axis in range(2):
-        errors[0, axis] = 0.5 * (reference_angles[axis] - angles[axis]
-                                 + reference_angles[axis + 2] - angles[axis + 2])
-        errors[1, axis] = 0.5 * (reference_rates[axis] - rates[axis]
-                                 + reference_rates[axis + 2] - rates[axis + 2])
+        first, second = twins[axis], twins[axis + 2]
+        errors[0, axis] = 0.5 * (reference_angles[first] - angles[first]
+                                 + reference_angles[second] - angles[second])
+        errors[1, axis] = 0.5 * (reference_rates[first] - rates[first]
+                                 + reference_rates[second] - rates[second])
 
 
 @kernel

@@ -22,6 +22,8 @@ from math import exp, pi, sin
 
 from fourbar_ros.control.accounts import Accounts, LONGEST_PERIOD
 from fourbar_ros.control.allocation import mobilities
+from fourbar_ros.control.branch import Branch, LINKS_ALONE
+from fourbar_ros.control.choice import choose
 from fourbar_ros.control.drive import WheelCommand, WheelDrive
 from fourbar_ros.control.feasibility import (
     check_needs,
@@ -33,12 +35,13 @@ from fourbar_ros.control.guide import Guide
 from fourbar_ros.control.law import TrackingLaw
 from fourbar_ros.control.momentum import MomentumWatch
 from fourbar_ros.control.reference import SoftStep, Way
-from fourbar_ros.control.setpoint import check_names, follow, plan, SetpointError
+from fourbar_ros.control.setpoint import check_names, follow, SetpointError
 from fourbar_ros.control.settings import ControllerSettings
 from fourbar_ros.control.stability import check_gains, GainError
 from fourbar_ros.control.trajectory import Point, read_trajectory
 from fourbar_ros.control.wheel_watch import SHORTED, WheelWatch
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, Mechanism
+from fourbar_ros.mechanism.closure import branch_of
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
@@ -148,6 +151,12 @@ class Controller:
         """Last accepted goal of the links (4,) [rad], None without one."""
         return self._guide.goal
 
+    @property
+    def branch(self) -> str:
+        """The branch of the reference: `parallelogram`, `folded`, `crossed` or `open`."""
+        branch = self._guide.branch
+        return branch_of(self._guide.angles) if branch is None else branch.name
+
     def tune(self, settings: ControllerSettings) -> None:
         """
         Take over settings; a move under way keeps its duration.
@@ -208,19 +217,25 @@ class Controller:
             self._check_driving()
             self._check_stamp(stamp_ns)
             self._leave_damping()
-            guide, crossing = self._guide, self._crossing
-            step, goal = plan(
-                self.mechanism, goals, guide.motion.copy(), guide.angles, guide.destination,
-                self.settings.setpoint_duration, crossing=crossing)
+            chosen = choose(self.mechanism, goals, self._guide, self.settings.setpoint_duration,
+                            self.settings.change_points)
+            step, present, branch = chosen.step, chosen.present, chosen.branch
             if self.settings.setpoint_timing == 'shortest':
-                step = self._shortest(step)
+                step = self._shortest(step, present, branch)
             else:
+<<<<<<< HEAD
                 check_needs(self.mechanism, step, guide.angles,
                             self._wheels_after(step.duration), crossing=crossing)
+=======
+                check_needs(self.mechanism, step, present, self._wheels_after(step.duration),
+                            share=self.law.share, crossing=self._crossing, branch=branch)
+>>>>>>> f340377db8a070c3efa1731b9d215618eeb2e26b
         except SetpointError as error:
             self._refuse(error, was)
             raise
-        self._accept(step, goal)
+        if branch is not None and branch != self._guide.branch:
+            self._guide.change_to(branch)
+        self._accept(step, chosen.goal)
 
     def trajectory(self, names: Sequence[str], points: Sequence[Point], stamp_ns: int = 0
                    ) -> None:
@@ -240,9 +255,13 @@ class Controller:
             guide, crossing = self._guide, self._crossing
             way, goal = read_trajectory(
                 self.mechanism, names, points, guide.motion.copy(), guide.angles,
-                guide.destination, crossing=crossing)
+                guide.destination, crossing=crossing, branch=guide.branch)
             check_needs(self.mechanism, way, guide.angles, self._wheels_after(way.duration),
+<<<<<<< HEAD
                         crossing=crossing)
+=======
+                        share=self.law.share, crossing=crossing, branch=guide.branch)
+>>>>>>> f340377db8a070c3efa1731b9d215618eeb2e26b
         except SetpointError as error:
             self._refuse(error, was)
             raise
@@ -299,7 +318,11 @@ class Controller:
 
     @property
     def _crossing(self) -> bool:
-        return self.settings.change_points == 'keep'
+        return self.settings.change_points != 'avoid'
+
+    @property
+    def _choosing(self) -> bool:
+        return self.settings.change_points == 'choose'
 
     def _measure_period(self, stamp_ns: int) -> float:
         """Return the time since the last tick, 0 after a gap, and check the gains for it."""
@@ -341,11 +364,11 @@ class Controller:
         elif self.mode == 'idle':
             self.mode, self.problem = 'hold', ''
         if self.mode == 'hold' and was in ('disarmed', 'idle'):
-            self._guide.begin(self.angles)
+            self._guide.begin(self.angles, choosing=self._choosing)
             self._drive.begin(self.speeds)
             self._forget_wheels()
         elif self.mode in ('disarmed', 'idle'):
-            self._guide.begin(self.angles)
+            self._guide.begin(self.angles, choosing=self._choosing)
 
     def _forget_wheels(self) -> None:
         """Think well of all wheels again, and share among all."""
@@ -387,11 +410,18 @@ class Controller:
         left = guide.time_left(self._stamp_ns)
         try:
             shortest = shortest_duration(
+<<<<<<< HEAD
                 self.mechanism, guide.motion.copy(), goal[:2], guide.angles,
                 self._wheels_after(0.0), crossing=self._crossing)
+=======
+                self.mechanism, guide.motion.copy(), goal[guide.axes], guide.angles,
+                self._wheels_after(0.0), share=self.law.share, crossing=self._crossing,
+                branch=guide.branch)
+>>>>>>> f340377db8a070c3efa1731b9d215618eeb2e26b
             if shortest > left:
-                move = SoftStep(guide.motion.copy(), goal[:2], shortest)
-                follow(self.mechanism, move, guide.angles, crossing=self._crossing)
+                move = SoftStep(guide.motion.copy(), goal[guide.axes], shortest)
+                follow(self.mechanism, move, guide.angles, crossing=self._crossing,
+                       branch=guide.branch)
                 guide.go(move, goal, self._stamp_ns)
         except SetpointError as error:
             self.problem = f'the wheels that are left cannot go on: {error}'
@@ -404,7 +434,7 @@ class Controller:
 
     def _out_of_hold(self, angles: Array) -> bool:
         """Tell whether the reduced form does not exist here: the wheels coast through it."""
-        return not self._guide.parallel and abs(sin(angles[3] - angles[2])) < NO_HOLD
+        return not self._guide.paired and abs(sin(angles[3] - angles[2])) < NO_HOLD
 
     def _wheels_after(self, duration: float) -> Wheels:
         """Return the wheels as they are, and what their drift takes in a time [s]."""
@@ -416,13 +446,17 @@ class Controller:
         friction = np.full(4, self.settings.bearing_coulomb)
         return Wheels(speeds, metric, friction, PLANNED * self.law.share)
 
-    def _shortest(self, move: SoftStep) -> SoftStep:
-        guide = self._guide
+    def _shortest(self, move: SoftStep, present: Array, branch: Branch | None) -> SoftStep:
         duration = shortest_duration(
+<<<<<<< HEAD
             self.mechanism, move.start, move.goal, guide.angles, self._wheels_after(0.0),
             crossing=self._crossing)
+=======
+            self.mechanism, move.start, move.goal, present, self._wheels_after(0.0),
+            share=self.law.share, crossing=self._crossing, branch=branch)
+>>>>>>> f340377db8a070c3efa1731b9d215618eeb2e26b
         shortest = SoftStep(move.start, move.goal, duration)
-        follow(self.mechanism, shortest, guide.angles, crossing=self._crossing)
+        follow(self.mechanism, shortest, present, crossing=self._crossing, branch=branch)
         return shortest
 
     def _leave_damping(self) -> None:
@@ -434,7 +468,8 @@ class Controller:
         if self._stamp_ns is None:
             return
         if self.mode == 'damp':
-            self._guide.move_from(self.angles, self.rates, self._stamp_ns)
+            self._guide.move_from(
+                self.angles, self.rates, self._stamp_ns, choosing=self._choosing)
         else:
             self._guide.halt(self._stamp_ns)
             self._guide.goal = None
@@ -491,8 +526,8 @@ class Controller:
         # Not by `check_needs`: not every linkage closes with all angles the same.
         times = move.instants(2)
         wheel_loads(
-            times, np.tile(square, (2, 1)), move.sample(times)[:, 1:], self._guide.parallel,
-            self.law.mobilities, np.array([self.mechanism.constants]))
+            times, np.tile(square, (2, 1)), move.sample(times)[:, 1:], self._guide.paired,
+            LINKS_ALONE, self.law.mobilities, np.array([self.mechanism.constants]))
 
 
 def _bearings_of(settings: ControllerSettings) -> Array:

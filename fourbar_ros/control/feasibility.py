@@ -21,7 +21,8 @@ Along the way, `A du + b` is what the wheels must meet (paper eq. 6). They share
 
 the smallest sum of `tau_i^2 / V_i`; mobilities `V = diag(If)^2` make it paper eq. 8, and 0 leaves
 a wheel out. Speeds follow from `If (d omega/dt + d Omega/dt) = tau`. On the parallelogram branch
-`omega_c = omega_a` and `omega_d = omega_b` at change points too, and so A and b are taken.
+`omega_c = omega_a` and `omega_d = omega_b` at change points too, and so A and b are taken; on
+other branches where links turn in pairs likewise.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ from dataclasses import dataclass, field
 from math import ceil, inf
 
 from fourbar_ros.control.axes import pair_terms
+from fourbar_ros.control.branch import Branch, branch_at, LINKS_ALONE
 from fourbar_ros.control.reference import SoftStep, Way
 from fourbar_ros.control.setpoint import (
     angles_along,
     follow,
-    on_parallelogram,
     SetpointError,
 )
 from fourbar_ros.mechanism import ClosureError, FLYWHEEL_NAMES, Mechanism
@@ -108,23 +109,26 @@ class Needs:
     unmet: float
 
 
-def needs_of(mechanism: Mechanism, way: Way, present: Array, wheels: Wheels) -> Needs:
+def needs_of(mechanism: Mechanism, way: Way, present: Array, wheels: Wheels,
+             branch: Branch | None = None) -> Needs:
     """
     Work out what a motion needs of the wheels.
 
     :param present: (4,) link angles where it begins, which tell the branch [rad].
+    :param branch: as of `setpoint.plan`.
     :raises SetpointError: the loop cannot close on the way.
     """
     times = way.instants(SAMPLES)
     states = way.sample(times)
+    branch = branch or branch_at(mechanism, present)
     try:
-        angles = angles_along(mechanism, states[:, 0], present)
+        angles = angles_along(mechanism, states[:, 0], present, branch)
     except ClosureError as error:
         raise SetpointError(f'on the way there {error}') from None
-    parallel = on_parallelogram(mechanism, present)
     torques, gained, unmet = wheel_loads(
-        times, angles, states[:, 1:], parallel, np.asarray(wheels.mobilities, dtype=float),
-        np.array([mechanism.constants]))
+        times, angles, states[:, 1:], branch is not None,
+        LINKS_ALONE if branch is None else branch.twins,
+        np.asarray(wheels.mobilities, dtype=float), np.array([mechanism.constants]))
     speeds = wheels.speeds + gained
     # Friction acts against the wheel; at rest, against where it is about to go.
     direction = np.where(speeds == 0.0, np.sign(torques), np.sign(speeds))
@@ -134,7 +138,8 @@ def needs_of(mechanism: Mechanism, way: Way, present: Array, wheels: Wheels) -> 
 
 
 def check_needs(mechanism: Mechanism, way: Way, present: Array, wheels: Wheels, *,
-                share: float = SHARE, crossing: bool = False) -> Needs:
+                share: float = SHARE, crossing: bool = False, branch: Branch | None = None
+                ) -> Needs:
     """
     Refuse a motion for which the wheels are too weak.
 
@@ -143,18 +148,19 @@ def check_needs(mechanism: Mechanism, way: Way, present: Array, wheels: Wheels, 
     :param present: (4,) link angles where it begins [rad].
     :param share: of the limits of the motors that it may use.
     :param crossing: as of `setpoint.follow`, for the shortest duration that is told.
+    :param branch: as of `setpoint.plan`.
     :returns: what it needs.
     :raises SetpointError: it needs too much; tells the wheel that lacks most, what it needs, the
         limit and, for a soft step, the shortest duration.
     """
-    needs = needs_of(mechanism, way, present, wheels)
+    needs = needs_of(mechanism, way, present, wheels, branch)
     excess, problem = _worst(mechanism, needs, wheels, share)
     if excess <= 1.0 + ROUNDING:
         return needs
     if isinstance(way, SoftStep) and needs.unmet <= UNMET:
         try:
             shortest = shortest_duration(mechanism, way.start, way.goal, present, wheels,
-                                         share=share, crossing=crossing)
+                                         share=share, crossing=crossing, branch=branch)
         except SetpointError as error:
             problem += f'; {error}'
         else:
@@ -164,7 +170,8 @@ def check_needs(mechanism: Mechanism, way: Way, present: Array, wheels: Wheels, 
 
 
 def shortest_duration(mechanism: Mechanism, start: Array, goal: Array, present: Array,
-                      wheels: Wheels, *, share: float = SHARE, crossing: bool = False) -> float:
+                      wheels: Wheels, *, share: float = SHARE, crossing: bool = False,
+                      branch: Branch | None = None) -> float:
     """
     Find the least duration for which a soft step keeps the limits of the motors.
 
@@ -173,11 +180,13 @@ def shortest_duration(mechanism: Mechanism, start: Array, goal: Array, present: 
     `SCAN_RATIO` meets, refined, and a narrow window below it may be missed. From motion the way
     depends on the duration, too, and is followed; from rest it does not, and is not.
 
-    :param start: (3, 2) reference angle, rate and acceleration of (phi_a, phi_b) now.
-    :param goal: (2,) of links a and b [rad].
+    :param start: (3, 2) reference angle, rate and acceleration of the axes now, (phi_a, phi_b)
+        or those of the branch.
+    :param goal: (2,) of the axes [rad].
     :param present: (4,) reference of the link angles now [rad].
     :param share: of the limits of the motors that it may use.
     :param crossing: whether the way may meet change points, as of `setpoint.follow`.
+    :param branch: as of `setpoint.plan`.
     :returns: at least `LEAST_DURATION`, not more than `RESOLUTION` of it too long [s].
     :raises SetpointError: no duration up to `LONGEST_DURATION` is enough.
     """
@@ -187,8 +196,8 @@ def shortest_duration(mechanism: Mechanism, start: Array, goal: Array, present: 
         step = SoftStep(start, goal, duration)
         try:
             if moving:
-                follow(mechanism, step, present, crossing=crossing)
-            needs = needs_of(mechanism, step, present, wheels)
+                follow(mechanism, step, present, crossing=crossing, branch=branch)
+            needs = needs_of(mechanism, step, present, wheels, branch)
         except SetpointError:
             return inf
         return _worst(mechanism, needs, wheels, share)[0]
@@ -267,15 +276,16 @@ def _holding_voltages(mechanism: Mechanism, wheels: Wheels) -> Array:
 
 
 @kernel
-def wheel_loads(times: Array, angles: Array, motion: Array, parallel: bool, mobilities: Array,
-                constants: NDArray[np.record]) -> tuple[Array, Array, float]:
+def wheel_loads(times: Array, angles: Array, motion: Array, paired: bool,
+                twins: NDArray[np.int64], mobilities: Array, constants: NDArray[np.record]
+                ) -> tuple[Array, Array, float]:
     """
     Share the demand along a way among the wheels.
 
     :param times: (n,) [s].
     :param angles: (n, 4) of the links [rad].
-    :param motion: (n, 2, 2) rates and accelerations of links a and b [rad/s], [rad/s^2].
-    :param parallel: whether it stays on the parallelogram branch.
+    :param motion: (n, 2, 2) rates and accelerations of the axes [rad/s], [rad/s^2].
+    :param paired, twins: see axes.axes_of; of links alone, the axes come first in twins.
     :param mobilities: (4,), 0 where a wheel cannot be used.
     :param constants: (1,) of the mechanism.
     :returns: (n, 4) torques [N m]; (n, 4) what the wheels gain in speed relative to their links
@@ -287,23 +297,30 @@ def wheel_loads(times: Array, angles: Array, motion: Array, parallel: bool, mobi
     link_rates = np.empty((count, 4))
     share = np.empty(2)
     largest = unmet = 0.0
+    wheel_map = np.zeros((4, 2))
+    for axis in range(2):
+        wheel_map[twins[axis], axis] = wheel_map[twins[axis + 2], axis] = 1.0
     for n in range(count):
-        rate_a, rate_b = motion[n, 0, 0], motion[n, 0, 1]
-        if parallel:
+        if paired:
+            for wheel in range(4):
+                link_rates[n, wheel] = (wheel_map[wheel, 0] * motion[n, 0, 0]
+                                        + wheel_map[wheel, 1] * motion[n, 0, 1])
             _, _, a00, a01, a11, b0, b1 = pair_terms(
-                angles[n], (rate_a, rate_b, rate_a, rate_b), constants[0])
-            g1, g2, g3, g4 = 1.0, 0.0, 0.0, 1.0
+                angles[n], (link_rates[n, 0], link_rates[n, 1], link_rates[n, 2],
+                            link_rates[n, 3]), twins, constants[0])
         else:
             a00, a01, a11, b0, b1, g1, g2, g3, g4, _, _ = reduced_terms_at(
                 angles[n], motion[n, 0], constants[0])
-        link_rates[n] = (rate_a, rate_b, g1 * rate_a + g2 * rate_b, g3 * rate_a + g4 * rate_b)
-        wheel_map = ((1.0, 0.0), (0.0, 1.0), (g1, g2), (g3, g4))
+            wheel_map[2, 0], wheel_map[2, 1], wheel_map[3, 0], wheel_map[3, 1] = g1, g2, g3, g4
+            for wheel in range(4):
+                link_rates[n, wheel] = (wheel_map[wheel, 0] * motion[n, 0, 0]
+                                        + wheel_map[wheel, 1] * motion[n, 0, 1])
         demand_a = a00 * motion[n, 1, 0] + a01 * motion[n, 1, 1] + b0
         demand_b = a01 * motion[n, 1, 0] + a11 * motion[n, 1, 1] + b1
         _solve_shares(wheel_map, mobilities, demand_a, demand_b, share)
         left_a, left_b = demand_a, demand_b
         for wheel in range(4):
-            first, second = wheel_map[wheel]
+            first, second = wheel_map[wheel, 0], wheel_map[wheel, 1]
             torque = -mobilities[wheel] * (first * share[0] + second * share[1])
             torques[n, wheel] = torque
             left_a += first * torque
@@ -321,12 +338,12 @@ def wheel_loads(times: Array, angles: Array, motion: Array, parallel: bool, mobi
 
 
 @kernel
-def _solve_shares(wheel_map: tuple[tuple[float, float], ...], mobilities: Array,
-                  demand_a: float, demand_b: float, share: Array) -> None:
+def _solve_shares(wheel_map: Array, mobilities: Array, demand_a: float, demand_b: float,
+                  share: Array) -> None:
     """Solve G V G^T share = demand; by the pseudo-inverse where wheels do not reach both axes."""
     n00 = n01 = n11 = 0.0
     for wheel in range(4):
-        first, second = wheel_map[wheel]
+        first, second = wheel_map[wheel, 0], wheel_map[wheel, 1]
         n00 += mobilities[wheel] * first * first
         n01 += mobilities[wheel] * first * second
         n11 += mobilities[wheel] * second * second

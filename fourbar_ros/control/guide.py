@@ -16,10 +16,9 @@
 
 from __future__ import annotations
 
-from math import pi
-
+from fourbar_ros.control.branch import Branch, branch_at
 from fourbar_ros.control.reference import SoftStep, Way
-from fourbar_ros.control.setpoint import follow, on_parallelogram, SetpointError
+from fourbar_ros.control.setpoint import follow, SetpointError
 from fourbar_ros.mechanism import Mechanism, nearest_assembly
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix
@@ -39,10 +38,10 @@ class Guide:
     :param mechanism: the linkage that the controller believes in.
     :ivar angles: (4,) continuous [rad].
     :ivar rates: (4,) [rad/s].
-    :ivar accelerations: (4,) of a and b; c and d follow but for what their change of gearing adds
-        [rad/s^2].
+    :ivar accelerations: (4,) of the axes; the others follow but for what their change of gearing
+        adds [rad/s^2].
     :ivar goal: (4,) where the last accepted move ends, None without one [rad].
-    :ivar parallel: whether it is on the parallelogram branch, where opposite links stay parallel.
+    :ivar branch: on which links turn in pairs; None where they do not.
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
@@ -50,7 +49,7 @@ class Guide:
         self.rates = np.zeros(4)
         self.accelerations = np.zeros(4)
         self.goal: Array | None = None
-        self.parallel = False
+        self.branch: Branch | None = None
         self._mechanism = mechanism
         self._motion = np.zeros((3, 2))
         self._offsets = np.zeros(2)
@@ -59,8 +58,23 @@ class Guide:
 
     @property
     def motion(self) -> Array:
-        """Angle, rate and acceleration of (phi_a, phi_b) now (3, 2) [rad, rad/s, rad/s^2]."""
+        """Angle, rate and acceleration of the two axes now (3, 2) [rad, rad/s, rad/s^2]."""
         return self._motion
+
+    @property
+    def axes(self) -> list[int]:
+        """The links that are its axes: a and b, or the first of each pair."""
+        return [0, 1] if self.branch is None else self.branch.axes
+
+    @property
+    def paired(self) -> bool:
+        """Whether links turn in pairs."""
+        return self.branch is not None
+
+    @property
+    def resting(self) -> bool:
+        """Whether nothing of it moves."""
+        return self._way is None and not self._motion[1:].any()
 
     @property
     def moving(self) -> bool:
@@ -72,29 +86,25 @@ class Guide:
         """Where the links are going, or are (4,) [rad]."""
         return self.angles if self._way is None or self.goal is None else self.goal
 
-    def begin(self, angles: Array) -> None:
+    def begin(self, angles: Array, *, choosing: bool = False) -> None:
         """
         Stand where the links are, without a goal.
 
         :param angles: (4,) [rad].
+        :param choosing: whether branches other than the parallelogram come into question.
         """
         self._way = self.goal = None
-        self.parallel = on_parallelogram(self._mechanism, angles)
-        self._motion[0], self._motion[1:] = angles[:2], 0.0
-        self.rates[:] = self.accelerations[:] = 0.0
-        self.angles = np.array(angles)
-        if self.parallel:
-            # Nearest to all four, on whatever turns they are.
-            apart = angles[2:] - angles[:2]
-            self._offsets = 2.0 * pi * np.round(apart / (2.0 * pi))
-            self._motion[0] += 0.5 * (apart - self._offsets)
-            self._spread()
+        self._stand_on(branch_at(self._mechanism, angles, choosing=choosing), angles)
+
+    def change_to(self, branch: Branch) -> None:
+        """Rest on another branch, where it meets the present one."""
+        self._stand_on(branch, self.angles)
 
     def stand_at(self, angles: Array) -> None:
         """Be where the links are, as long as nothing drives them (4,) [rad]."""
         self._way = None
         self.angles[:] = angles
-        self._motion[0], self._motion[1:] = angles[:2], 0.0
+        self._motion[0], self._motion[1:] = angles[self.axes], 0.0
         self.rates[:] = self.accelerations[:] = 0.0
 
     def go(self, way: Way, goal: Array, start_ns: int) -> None:
@@ -118,7 +128,8 @@ class Guide:
                 self._motion.copy(), self._motion[0] + STOPPING_SHARE * time * self._motion[1],
                 time)
             try:
-                end = follow(self._mechanism, stop, self.angles, crossing=self.parallel)[-1]
+                end = follow(self._mechanism, stop, self.angles, crossing=self.paired,
+                             branch=self.branch)[-1]
             except SetpointError:
                 # A change point is nearer than that.
                 time *= 0.5
@@ -129,14 +140,16 @@ class Guide:
         self._motion[1:] = 0.0
         self.rates[:] = self.accelerations[:] = 0.0
 
-    def move_from(self, angles: Array, rates: Array, start_ns: int) -> None:
+    def move_from(self, angles: Array, rates: Array, start_ns: int, *, choosing: bool = False
+                  ) -> None:
         """
         Take over the links as they move, and bring them to rest.
 
         :param angles, rates: (4,) [rad], [rad/s].
+        :param choosing: as of :meth:`begin`.
         """
-        self.begin(angles)
-        self._motion[1] = rates[:2]
+        self.begin(angles, choosing=choosing)
+        self._motion[1] = rates[self.axes]
         self.halt(start_ns)
         self.goal = None
 
@@ -151,10 +164,10 @@ class Guide:
             return False
         elapsed = (stamp_ns - self._start_ns) * 1e-9
         self._motion[:] = way.at(elapsed)
-        if self.parallel:
-            self._spread()
-        else:
+        if self.branch is None:
             self._close()
+        else:
+            self._spread(self.branch)
         if elapsed >= way.duration:
             self._way = None
             return True
@@ -165,10 +178,21 @@ class Guide:
         way = self._way
         return 0.0 if way is None else way.duration - (stamp_ns - self._start_ns) * 1e-9
 
-    def _spread(self) -> None:
-        for row, values in enumerate((self.angles, self.rates, self.accelerations)):
-            values[:2] = values[2:] = self._motion[row]
-        self.angles[2:] += self._offsets
+    def _stand_on(self, branch: Branch | None, angles: Array) -> None:
+        self.branch = branch
+        self.angles = np.array(angles)
+        if branch is not None:
+            # On whatever turns they are.
+            self.angles = branch.nearest(self.angles)
+            self._offsets = branch.offsets(self.angles)
+        self._motion[0], self._motion[1:] = self.angles[self.axes], 0.0
+        self.rates[:] = self.accelerations[:] = 0.0
+
+    def _spread(self, branch: Branch) -> None:
+        for axis, (first, second) in enumerate(branch.pairs):
+            for row, values in enumerate((self.angles, self.rates, self.accelerations)):
+                values[first] = values[second] = self._motion[row, axis]
+            self.angles[second] += self._offsets[axis]
 
     def _close(self) -> None:
         motion = self._motion

@@ -30,6 +30,7 @@ from fourbar_ros.control.axes import (
     HOLD,
     TERMS,
 )
+from fourbar_ros.control.branch import LINKS_ALONE
 from fourbar_ros.control.guide import Guide
 from fourbar_ros.control.null_space import null_torques, target_speeds
 from fourbar_ros.control.settings import ControllerSettings
@@ -40,8 +41,10 @@ from fourbar_ros.mechanism.motors import motors_of
 import numpy as np
 from numpy.typing import NDArray
 
-AXES = ('a', 'b')
-"""The axes by the links that they are named after; in a parallelogram c goes with a, d with b."""
+AXES = ('a', 'b', 'c', 'd')
+"""
+Axes by the links that they are named after: a and b; where links turn in pairs, the first of each.
+"""
 
 # Of what a motor can give, so much is shared out. The loop that follows speeds needs room: in the
 # limit it forgets what it has learnt.
@@ -62,7 +65,7 @@ class Decision:
 
     :param torques: (4,) that act on wheels and links alike, bearings apart [N m].
     :param planned: (4,) of these, what the reference alone asks for [N m].
-    :param rows: (3, 4) G and, where opposite links are parallel, the row of eta.
+    :param rows: (3, 4) G and, where links turn in pairs, the row of eta.
     :param terms: see tracking.
     :param scale: share of what was asked for that the motors can give.
     :param hold: how much of the hold on the branch there is.
@@ -107,17 +110,18 @@ def motor_bounds(speeds: Array, friction: Array, share: float, boxed: NDArray[np
 
 @kernel
 def decide(angles: Array, rates: Array, reference_angles: Array, reference_rates: Array,
-           acceleration: Array, disturbance: Array, wanted_speeds: Array, speeds: Array,
-           numbers: Array, parallel: bool, boxed: NDArray[np.record], mobilities: Array,
-           free_mobilities: Array, bounded: bool, lower: Array, upper: Array, rows: Array,
-           terms: Array, torques: Array, planned: Array) -> float:
+           accelerations: Array, disturbance: Array, wanted_speeds: Array, speeds: Array,
+           numbers: Array, paired: bool, twins: NDArray[np.int64], boxed: NDArray[np.record],
+           mobilities: Array, free_mobilities: Array, bounded: bool, lower: Array, upper: Array,
+           rows: Array, terms: Array, torques: Array, planned: Array) -> float:
     """
     Decide on the torques of the wheels.
 
     :param angles, rates: (4,) of the links, estimated [rad], [rad/s].
     :param reference_angles, reference_rates: (4,) [rad], [rad/s].
-    :param acceleration: (2,) of the reference on the axes [rad/s^2].
+    :param accelerations: (4,) of the reference [rad/s^2]; those of the axes count.
     :param disturbance: (2,) torques on links a and b besides those of the wheels [N m].
+    :param paired, twins: see axes.axes_of; of links alone, the axes come first in twins.
     :param wanted_speeds: (4,) where the freedom that moves no link leads the wheels [rad/s].
     :param speeds: (4,) of the wheels, absolute [rad/s].
     :param mobilities: (4,) see allocation.
@@ -126,13 +130,18 @@ def decide(angles: Array, rates: Array, reference_angles: Array, reference_rates
     :returns: share of what was asked for that the motors can give.
     """
     errors, bias, demand = np.empty((2, 2)), np.empty(3), np.empty(3)
-    axes_of(angles, rates, reference_angles, reference_rates, parallel, boxed, rows, errors, bias,
-            terms)
+    axes_of(angles, rates, reference_angles, reference_rates, paired, twins, boxed, rows, errors,
+            bias, terms)
+    acceleration, pushed = np.empty(2), np.zeros(2)
+    for axis in range(2):
+        acceleration[axis] = accelerations[twins[axis]]
+        # Links a and b are on axes of their own, or twins.
+        pushed[0 if twins[2] == axis else axis] += numbers[COMPENSATED] * disturbance[axis]
     plain = np.zeros((2, 2))
     demanded(acceleration, plain, 0.0, 0.0, 0.0, np.zeros(2), 0.0, bias, terms, demand)
     allocate(rows[:2], demand[:2], mobilities, lower, upper, False, planned)
     demanded(acceleration, errors, numbers[STIFFNESS], numbers[DAMPING], numbers[BAND],
-             numbers[COMPENSATED] * disturbance, numbers[STICKING], bias, terms, demand)
+             pushed, numbers[STICKING], bias, terms, demand)
     usable = 0
     for j in range(4):
         usable += mobilities[j] > 0.0
@@ -184,6 +193,7 @@ class TrackingLaw:
         self._numbers = np.zeros(8)
         self._free_mobilities = np.zeros(4)
         self._bounded = False
+        self._twins = LINKS_ALONE
         self._target = 'free'
         self._bias = 0.0
         self._wanted_speeds = np.zeros(4)
@@ -225,6 +235,7 @@ class TrackingLaw:
         """
         found, numbers = self.decision, self._numbers
         numbers[STICKING] = sticking
+        self._twins = LINKS_ALONE if guide.branch is None else guide.branch.twins
         wanted = self._wanted_speeds
         if self._target in ('zero', 'bias'):
             wanted = target_speeds(self._target, rates, self._bias)
@@ -232,9 +243,9 @@ class TrackingLaw:
             wheel_speeds, friction, self.share, self._motors, found.lower, found.upper)
         found.scale = decide(
             angles, rates, guide.angles, guide.rates, guide.accelerations, disturbance, wanted,
-            wheel_speeds + rates, numbers, guide.parallel, self._constants, self.mobilities,
-            self._free_mobilities, self._bounded, found.lower, found.upper, found.rows,
-            found.terms, found.torques, found.planned)
+            wheel_speeds + rates, numbers, guide.paired, self._twins, self._constants,
+            self.mobilities, self._free_mobilities, self._bounded, found.lower, found.upper,
+            found.rows, found.terms, found.torques, found.planned)
         found.hold = float(found.terms[HOLD])
         return found
 
@@ -242,5 +253,5 @@ class TrackingLaw:
         """Name the axes that the wheels can not drive."""
         rows = self.decision.rows[:2]
         directions, shares = controllable(rows, self.mobilities)
-        return [AXES[int(np.argmax(np.abs(direction)))]
+        return [AXES[self._twins[int(np.argmax(np.abs(direction)))]]
                 for direction, share in zip(directions, shares) if share < 1.0]

@@ -20,6 +20,12 @@ from collections.abc import Iterator, Sequence
 from itertools import product
 from math import ceil, pi, sin
 
+from fourbar_ros.control.branch import (
+    Branch,
+    branch_at,
+    opposite_links_equal,
+    PARALLELOGRAM,
+)
 from fourbar_ros.control.reference import SoftStep, Way
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import ClosureError, LINK_NAMES, Mechanism
@@ -28,7 +34,6 @@ from fourbar_ros.mechanism.by_name import RejectedError, values_by_name
 from fourbar_ros.mechanism.closure import assemble_along, assemblies
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
-from numpy.typing import ArrayLike
 
 # Closest approach to a change point that a move may plan, as |sin(phi_d - phi_c)|: there the
 # wheels' hold on the configuration is lost.
@@ -49,13 +54,6 @@ ROUNDING = 1e-9
 # How far two more named links may contradict the closure [rad].
 AGREEMENT = 1e-3
 
-# Lengths of opposite links that differ by less than this, relative to their mean, are equal.
-EQUAL_LENGTHS = 1e-9
-
-# Opposite links as close to parallel as this are taken to be on the parallelogram branch [rad]:
-# six times what a sensor of 0.1 deg is off. Another branch comes as close only where it meets it.
-PARALLEL = 0.01
-
 # Turns about the shortest way that are considered; the shortest comes first among equals.
 TURNS = (0, 1, -1)
 
@@ -65,6 +63,10 @@ PARTNER = {0: 1, 1: 0, 2: 1, 3: 0}
 
 class SetpointError(FourbarError):
     """A setpoint that is refused."""
+
+
+class ContradictionError(SetpointError):
+    """Named links that do not fit together, or do not determine the rest, on a branch."""
 
 
 def check_names(names: Sequence[str], positions: Sequence[float]) -> dict[int, float]:
@@ -80,24 +82,9 @@ def check_names(names: Sequence[str], positions: Sequence[float]) -> dict[int, f
         raise SetpointError(str(error)) from None
 
 
-def on_parallelogram(mechanism: Mechanism, link_angles: ArrayLike) -> bool:
-    """
-    Tell whether the linkage is on the parallelogram branch.
-
-    There opposite links stay parallel, and a way leads through change points. Close to one the
-    branches cannot be told apart, and the parallelogram is assumed.
-
-    :param link_angles: (4,) any turns [rad].
-    :returns: True where opposite links are equally long and parallel within `PARALLEL`.
-    """
-    angles = np.asarray(link_angles, dtype=float)
-    return _equal_opposite_links(mechanism) and all(
-        abs(wrap(angles[link + 2] - angles[link])) < PARALLEL for link in (0, 1))
-
-
 def plan(mechanism: Mechanism, goals: dict[int, float], start: Array, present: Array,
-         last_goal: Array, duration: float, *, crossing: bool = False
-         ) -> tuple[SoftStep, Array]:
+         last_goal: Array, duration: float, *, crossing: bool = False,
+         branch: Branch | None = None) -> tuple[SoftStep, Array]:
     """
     Plan the move that a setpoint asks for.
 
@@ -110,24 +97,29 @@ def plan(mechanism: Mechanism, goals: dict[int, float], start: Array, present: A
     and crossing is allowed, the shortest is taken that does not.
 
     :param goals: goal angle [rad] by link index, any turn.
-    :param start: (3, 2) reference angle, rate and acceleration of (phi_a, phi_b) now.
+    :param start: (3, 2) reference angle, rate and acceleration of the axes now: (phi_a, phi_b),
+        or those of the branch.
     :param present: (4,) reference of the link angles now [rad].
     :param last_goal: (4,) where they were going: what is not named goes there still [rad].
     :param duration: [s].
     :param crossing: whether the way may meet change points, where :func:`follow` can.
+    :param branch: on which it goes, by default the parallelogram where `present` is on it.
     :returns: the move, and the four link angles at its end [rad].
     :raises SetpointError: it cannot close, contradicts itself, or cannot be reached; the problem
         is that of the shortest way.
     """
     goals = shortest_ways(goals, last_goal)
-    ends = _ends(mechanism, goals, present, last_goal)
-    passes = (False, True) if crossing and on_parallelogram(mechanism, present) else (crossing,)
+    branch = branch or branch_at(mechanism, present)
+    ends = _ends(mechanism, goals, present, last_goal, branch)
+    axes = [0, 1] if branch is None else branch.axes
+    passes = (False, True) if crossing and branch else (crossing,)
     problems = []
     for allowed in passes:
         for end in ends:
-            move = SoftStep(np.array(start), end[:2], duration)
+            move = SoftStep(np.array(start), end[axes], duration)
             try:
-                reached: Array = follow(mechanism, move, present, crossing=allowed)[-1]
+                reached: Array = follow(
+                    mechanism, move, present, crossing=allowed, branch=branch)[-1]
                 check_agreement(reached, goals)
             except SetpointError as error:
                 problems.append((allowed, error))
@@ -147,20 +139,22 @@ def shortest_ways(goals: dict[int, float], last: Array) -> dict[int, float]:
     return {link: float(last[link]) + wrap(angle - last[link]) for link, angle in goals.items()}
 
 
-def complete(mechanism: Mechanism, goals: dict[int, float], present: Array, last: Array
-             ) -> list[Array]:
+def complete(mechanism: Mechanism, goals: dict[int, float], present: Array, last: Array,
+             branch: Branch | None = None) -> list[Array]:
     """
     Work out all four link angles at a goal.
 
     :param goals: angle [rad] of any number of links by index, on the turn that is meant.
     :param present: (4,) link angles now, which tell the branch [rad].
     :param last: (4,) where links that are not named hold or turn from [rad].
+    :param branch: as of :func:`plan`.
     :returns: the assemblies that fit, (4,) each, more likely first; more than two named links are
         not checked.
     :raises SetpointError: it cannot close, or is not determined.
     """
-    if on_parallelogram(mechanism, present):
-        return [_complete_parallelogram(goals, last)]
+    branch = branch or branch_at(mechanism, present)
+    if branch is not None:
+        return [_complete_pairs(branch, goals, last)]
     known, guess = _known(goals), np.array(last)
     for link in known:
         guess[link] = goals.get(link, float(last[link]))
@@ -176,40 +170,46 @@ def complete(mechanism: Mechanism, goals: dict[int, float], present: Array, last
         raise SetpointError(str(error)) from None
 
 
-def follow(mechanism: Mechanism, move: Way, present: Array, *, crossing: bool = False) -> Array:
+def follow(mechanism: Mechanism, move: Way, present: Array, *, crossing: bool = False,
+           branch: Branch | None = None) -> Array:
     """
     Follow a planned move.
 
     :param present: (4,) link angles at its start [rad].
-    :param crossing: whether it may meet change points. It can on the parallelogram branch of a
-        linkage whose opposite links are equal; then it stays on this branch.
-    :returns: (n, 4) link angles at instants of the whole way, ends included, links a and b
-        turning by not much more than `FINEST` between two [rad].
+    :param crossing: whether it may meet change points. It can on a branch where links turn in
+        pairs, as on the parallelogram branch; then it stays on this branch.
+    :param branch: as of :func:`plan`.
+    :returns: (n, 4) link angles at instants of the whole way, ends included, the axes turning by
+        not much more than `FINEST` between two [rad].
     :raises SetpointError: it meets a change point, or the loop cannot close on the way.
     """
+    branch = branch or branch_at(mechanism, present)
     for path in _paths(move):
         try:
-            angles = angles_along(mechanism, path, present)
+            angles = angles_along(mechanism, path, present, branch)
         except ClosureError as error:
             raise SetpointError(f'on the way there {error}') from None
-        if not (crossing and on_parallelogram(mechanism, present)):
-            _check_distance(mechanism, angles, crossing)
+        if not (crossing and branch):
+            _check_distance(mechanism, angles, crossing, branch)
     return angles
 
 
-def angles_along(mechanism: Mechanism, path: Array, present: Array) -> Array:
+def angles_along(mechanism: Mechanism, path: Array, present: Array,
+                 branch: Branch | None = None) -> Array:
     """
-    Complete a path of (phi_a, phi_b) to four link angles, on the branch on which it begins.
+    Complete a path of the axes to four link angles, on the branch on which it begins.
 
     :param path: (n, 2) [rad].
     :param present: (4,) link angles where it begins [rad].
-    :returns: (n, 4), continuous with them; opposite links exactly parallel on the parallelogram
-        branch [rad].
+    :param branch: as of :func:`plan`.
+    :returns: (n, 4), continuous with them; twins exactly parallel where links turn in pairs
+        [rad].
     :raises ClosureError: the loop cannot close somewhere on the path.
     """
-    if not on_parallelogram(mechanism, present):
+    branch = branch or branch_at(mechanism, present)
+    if branch is None:
         return assemble_along(mechanism, path[:, 0], path[:, 1], present)
-    return np.hstack([path, path + _whole_turns(present[2:] - present[:2])])
+    return branch.spread(path, branch.offsets(present))
 
 
 def check_agreement(reached: Array, goals: dict[int, float]) -> None:
@@ -218,24 +218,13 @@ def check_agreement(reached: Array, goals: dict[int, float]) -> None:
 
     :param reached: (4,) link angles [rad].
     :param goals: angle [rad] by link index, any turn.
-    :raises SetpointError: they differ by more than `AGREEMENT`.
+    :raises ContradictionError: they differ by more than `AGREEMENT`.
     """
     for link, angle in goals.items():
         if abs(wrap(reached[link] - angle)) > AGREEMENT:
-            raise SetpointError(
+            raise ContradictionError(
                 f'{LINK_NAMES[link]} would end at {reached[link]:.4f} rad and not at '
                 f'{angle:.4f} rad: the named links do not fit together on this branch')
-
-
-def _equal_opposite_links(mechanism: Mechanism) -> bool:
-    lengths = mechanism.link_lengths
-    limit = EQUAL_LENGTHS * float(lengths.mean())
-    return bool(np.abs(lengths[:2] - lengths[2:]).max() <= limit)
-
-
-def _whole_turns(angles: Array) -> Array:
-    turns: Array = 2.0 * pi * np.round(angles / (2.0 * pi))
-    return turns
 
 
 def _known(goals: dict[int, float]) -> tuple[int, int]:
@@ -244,12 +233,12 @@ def _known(goals: dict[int, float]) -> tuple[int, int]:
     return first, others[0] if others else PARTNER[first]
 
 
-def _turned(mechanism: Mechanism, goals: dict[int, float], present: Array, last_goal: Array
+def _turned(goals: dict[int, float], last_goal: Array, branch: Branch | None
             ) -> list[dict[int, float]]:
     """List goals with further turns of the links that determine the rest, least travel first."""
-    if on_parallelogram(mechanism, present):
+    if branch is not None:
         # Those on one axis turn together.
-        axes = [[link for link in goals if link % 2 == axis] for axis in (0, 1)]
+        axes = [[link for link in goals if branch.axis_of(link) == axis] for axis in (0, 1)]
         groups = [axis for axis in axes if axis]
     else:
         groups = [[link] for link in _known(goals) if link in goals]
@@ -266,49 +255,53 @@ def _turned(mechanism: Mechanism, goals: dict[int, float], present: Array, last_
     return [turned for _, turned in found]
 
 
-def _ends(mechanism: Mechanism, goals: dict[int, float], present: Array, last_goal: Array
-          ) -> list[Array]:
+def _ends(mechanism: Mechanism, goals: dict[int, float], present: Array, last_goal: Array,
+          branch: Branch | None) -> list[Array]:
     """List where a move may end, (4,) each, in the order in which that is tried."""
-    shortest, *further = _turned(mechanism, goals, present, last_goal)
-    ends = complete(mechanism, shortest, present, last_goal)
+    shortest, *further = _turned(goals, last_goal, branch)
+    ends = complete(mechanism, shortest, present, last_goal, branch)
     # Joint 3 stays on its side; of the shortest way both ends are tried, for what to say.
     side = sin(present[3] - present[2]) >= 0.0
-    parallel = on_parallelogram(mechanism, present)
+    axes = [0, 1] if branch is None else branch.axes
     for turned in further:
-        for end in complete(mechanism, turned, present, last_goal):
-            fits = parallel or (sin(end[3] - end[2]) >= 0.0) == side
-            if fits and all(np.abs(end[:2] - other[:2]).max() > ROUNDING for other in ends):
+        for end in complete(mechanism, turned, present, last_goal, branch):
+            fits = branch or (sin(end[3] - end[2]) >= 0.0) == side
+            if fits and all(np.abs((end - other)[axes]).max() > ROUNDING for other in ends):
                 ends.append(end)
     return ends
 
 
-def _complete_parallelogram(goals: dict[int, float], last: Array) -> Array:
-    if len(goals) > 1 and len({link % 2 for link in goals}) == 1:
+def _complete_pairs(branch: Branch, goals: dict[int, float], last: Array) -> Array:
+    if len(goals) > 1 and len({branch.axis_of(link) for link in goals}) == 1:
         named = ' and '.join(f'{LINK_NAMES[link]} = {angle:.4f} rad'
                              for link, angle in sorted(goals.items()))
-        raise SetpointError(f'{named} do not determine the configuration')
-    offsets = _whole_turns(last[2:] - last[:2])
-    end = np.empty(4)
-    for axis in (0, 1):
-        angle = goals.get(axis)
-        if angle is None:
-            angle = (goals[axis + 2] - offsets[axis] if axis + 2 in goals else last[axis])
-        end[axis], end[axis + 2] = angle, angle + offsets[axis]
-    return end
+        where = '' if branch == PARALLELOGRAM else (
+            f' on the {branch.name} branch, where they turn together')
+        raise ContradictionError(f'{named} do not determine the configuration{where}')
+    offsets = branch.offsets(last)
+    path = last[branch.axes]
+    for axis, (first, second) in enumerate(branch.pairs):
+        if first in goals:
+            path[axis] = goals[first]
+        elif second in goals:
+            path[axis] = goals[second] - offsets[axis]
+    return branch.spread(path, offsets)
 
 
-def _check_distance(mechanism: Mechanism, angles: Array, crossing: bool) -> None:
-    folds = np.abs(np.sin(angles[:, 3] - angles[:, 2]))
+def _check_distance(mechanism: Mechanism, angles: Array, crossing: bool,
+                    branch: Branch | None) -> None:
+    c, d = (2, 3) if branch is None else branch.followers
+    folds = np.abs(np.sin(angles[:, d] - angles[:, c]))
     # Keeping the distance, or moving away, is always allowed, whatever rounding says.
     limits = np.minimum(np.maximum.accumulate(folds), CHANGE_POINT_MARGIN) - ROUNDING
     if (folds < limits).any():
         reason = ''
         if crossing:
             reason = (', and only the parallelogram branch leads through it'
-                      if _equal_opposite_links(mechanism) else
+                      if opposite_links_equal(mechanism) else
                       ', and only opposite links of equal length lead through it')
         raise SetpointError(
-            'on the way there link_c and link_d fold onto a line '
+            f'on the way there {LINK_NAMES[c]} and {LINK_NAMES[d]} fold onto a line '
             f'(|sin| = {float(folds[folds < limits].min()):.3f}, limit {CHANGE_POINT_MARGIN:g}), '
             f'a change point{reason}')
 

@@ -30,7 +30,7 @@ WHEEL_TARGETS = ('free', *TARGETS)
 TIMINGS = ('duration', 'shortest')
 
 # What becomes of moves that meet a change point.
-CHANGE_POINTS = ('avoid', 'keep')
+CHANGE_POINTS = ('avoid', 'keep', 'choose')
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class ControllerSettings:
     :param rest_band: errors of the configuration that do nothing at rest, where friction in the
         joints holds it; 0 where there is none [rad].
     :param change_points: `avoid` refuses moves that meet one, `keep` crosses and parks on the
-        parallelogram's branch.
+        parallelogram's branch, `choose` also leaves on the other branch where a setpoint names it.
     :param branch_bandwidth: natural frequency of the hold on the branch at change points [rad/s].
     """
 

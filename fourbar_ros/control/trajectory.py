@@ -28,6 +28,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from math import ceil, isfinite
 
+from fourbar_ros.control.branch import Branch, branch_at
 from fourbar_ros.control.reference import evaluate, evaluate_many, quintic
 from fourbar_ros.control.setpoint import (
     AGREEMENT,
@@ -35,7 +36,6 @@ from fourbar_ros.control.setpoint import (
     check_names,
     complete,
     follow,
-    on_parallelogram,
     PARTNER,
     SetpointError,
     shortest_ways,
@@ -82,7 +82,7 @@ class Knot:
 
     :param time: [s].
     :param angles: (4,) continuous [rad].
-    :param rates: (2,) of links a and b, NaN where not given [rad/s].
+    :param rates: (2,) of the axes, NaN where not given [rad/s].
     :param accelerations: (2,) likewise [rad/s^2].
     """
 
@@ -95,7 +95,7 @@ class Knot:
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """
-    A motion through given states, by quintics. Axes are (phi_a, phi_b).
+    A motion through given states, by quintics. Axes are (phi_a, phi_b), or those of a branch.
 
     :param times: (n,) increasing from 0, at least two [s].
     :param states: (n, 3, 2) angle, rate and acceleration at these times, at rest in the last one
@@ -189,8 +189,8 @@ def through(times: Array, angles: Array, rates: Array, accelerations: Array) -> 
 
 
 def read_trajectory(mechanism: Mechanism, names: Sequence[str], points: Sequence[Point],
-                    start: Array, present: Array, last_goal: Array, *, crossing: bool = False
-                    ) -> tuple[Trajectory, Array]:
+                    start: Array, present: Array, last_goal: Array, *, crossing: bool = False,
+                    branch: Branch | None = None) -> tuple[Trajectory, Array]:
     """
     Plan the motion that points with times ask for.
 
@@ -201,15 +201,19 @@ def read_trajectory(mechanism: Mechanism, names: Sequence[str], points: Sequence
 
     :param names: of links, each once.
     :param points: with a number for each name, times increasing from 0.
-    :param start: (3, 2) reference angle, rate and acceleration of (phi_a, phi_b) now.
+    :param start: (3, 2) reference angle, rate and acceleration of the axes now, (phi_a, phi_b)
+        or those of the branch.
     :param present: (4,) reference of the link angles now [rad].
     :param last_goal: (4,) where they were going: what is not named goes there still [rad].
     :param crossing: whether the way may meet change points, where `setpoint.follow` can.
+    :param branch: as of `setpoint.plan`.
     :returns: the motion, and the four link angles at its end [rad].
     :raises SetpointError: anything else, with the number of the point from 1; or a point cannot
         be reached.
     """
     _check_points(names, points)
+    branch = branch or branch_at(mechanism, present)
+    axes = [0, 1] if branch is None else branch.axes
     knots = [Knot(0.0, present, start[1], start[2])]
     for number, point in enumerate(points, 1):
         try:
@@ -218,18 +222,25 @@ def read_trajectory(mechanism: Mechanism, names: Sequence[str], points: Sequence
                 _check_beginning(goals, present)
                 continue
             if len(goals) == 1:
-                partner = PARTNER[next(iter(goals))]
+                partner = _partner(next(iter(goals)), branch)
                 goals[partner] = float(last_goal[partner])
-            knots.append(_knot(mechanism, names, point, goals, knots[-1].angles, present))
+            knots.append(_knot(mechanism, names, point, goals, knots[-1].angles, present,
+                               branch))
         except SetpointError as error:
             raise SetpointError(f'point {number} of {len(points)}: {error}') from None
     rest = np.zeros(2)
     trajectory = through(
         np.array([knot.time for knot in knots]),
-        np.array([start[0], *(knot.angles[:2] for knot in knots[1:])]),
+        np.array([start[0], *(knot.angles[axes] for knot in knots[1:])]),
         np.array([*(knot.rates for knot in knots[:-1]), rest]),
         np.array([*(knot.accelerations for knot in knots[:-1]), rest]))
-    return trajectory, follow(mechanism, trajectory, present, crossing=crossing)[-1]
+    return trajectory, follow(
+        mechanism, trajectory, present, crossing=crossing, branch=branch)[-1]
+
+
+def _partner(link: int, branch: Branch | None) -> int:
+    """Return the link that holds still when only one is named: not on the same axis."""
+    return PARTNER[link] if branch is None else branch.axes[1 - branch.axis_of(link)]
 
 
 def _check_points(names: Sequence[str], points: Sequence[Point]) -> None:
@@ -284,17 +295,16 @@ def _check_beginning(goals: dict[int, float], present: Array) -> None:
 
 
 def _knot(mechanism: Mechanism, names: Sequence[str], point: Point, goals: dict[int, float],
-          last: Array, present: Array) -> Knot:
+          last: Array, present: Array, branch: Branch | None) -> Knot:
     """
-    Work out what a point says of (phi_a, phi_b).
+    Work out what a point says of the axes.
 
     :param goals: angles of the links that are named or hold, on their turns [rad].
     :param last: (4,) link angles at the point before [rad].
     :param present: (4,) link angles now, which tell the branch [rad].
     """
-    parallel = on_parallelogram(mechanism, present)
-    ends = complete(mechanism, goals, present, last)
-    if not parallel:
+    ends = complete(mechanism, goals, present, last, branch)
+    if branch is None:
         # Joint 3 stays on its side: only a change point leads across.
         side = np.sin(present[3] - present[2])
         ends = [end for end in ends if np.sin(end[3] - end[2]) * side > 0.0]
@@ -306,29 +316,30 @@ def _knot(mechanism: Mechanism, names: Sequence[str], point: Point, goals: dict[
     links = [LINK_NAMES.index(name) for name in names]
     if len(point.velocities):
         given = {**dict.fromkeys(goals, 0.0), **dict(zip(links, point.velocities))}
-        rates = _dependent(mechanism, angles, given, np.zeros(4), parallel, 'velocity')
+        rates = _dependent(mechanism, angles, given, np.zeros(4), branch, 'velocity')
     if len(point.accelerations):
         if not len(point.velocities):
             raise SetpointError('accelerations are given, but no velocities')
         given = {**dict.fromkeys(goals, 0.0), **dict(zip(links, point.accelerations))}
-        accelerations = _dependent(mechanism, angles, given, rates, parallel, 'acceleration')
-    return Knot(point.time_s, angles, rates[:2], accelerations[:2])
+        accelerations = _dependent(mechanism, angles, given, rates, branch, 'acceleration')
+    axes = [0, 1] if branch is None else branch.axes
+    return Knot(point.time_s, angles, rates[axes], accelerations[axes])
 
 
 def _dependent(mechanism: Mechanism, angles: Array, given: dict[int, float], rates: Array,
-               parallel: bool, quantity: str) -> Array:
+               branch: Branch | None, quantity: str) -> Array:
     """
     Complete rates or accelerations of some links to all four, by the closure differentiated.
 
     :param angles: (4,) [rad].
     :param given: rate or acceleration by link, of two links at least.
     :param rates: (4,) of which accelerations come by themselves, 0 for rates [rad/s].
-    :param parallel: whether opposite links are parallel, at change points too.
+    :param branch: on which links turn in pairs, at change points too; None where they do not.
     """
     result = np.zeros(4)
-    if parallel:
-        for axis in (0, 1):
-            result[axis::2] = given[axis] if axis in given else given[axis + 2]
+    if branch is not None:
+        for first, second in branch.pairs:
+            result[[first, second]] = given[first] if first in given else given[second]
     else:
         known = sorted(given)[:2]
         rest = [link for link in range(4) if link not in known]

@@ -53,7 +53,8 @@ class ControllerStatus:
             if self._ticks % LOOK_EVERY == 1:
                 self._warning = controller.momentum.warning(controller.speeds)
         present = (controller.mode, controller.accepted, controller.refused, self.judged,
-                   controller.settings, controller.problem, controller.wheels.usable.tobytes(),
+                   controller.settings, controller.problem, controller.branch,
+                   controller.wheels.usable.tobytes(),
                    controller.wheels.verdicts.tobytes(), self._warning)
         if present == self._announced:
             return
@@ -65,7 +66,7 @@ class ControllerStatus:
         level, summary = self._summary()
         self._publisher.publish(status_message(
             self._node, '', level, summary, {
-                'mode': controller.mode, 'goal': goal,
+                'mode': controller.mode, 'goal': goal, 'branch': controller.branch,
                 'setpoint_duration_s': controller.settings.setpoint_duration,
                 'accepted': controller.accepted, 'refused': controller.refused,
                 'last_refusal': controller.last_refusal, 'judged_stamp_ns': self.judged,

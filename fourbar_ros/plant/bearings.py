@@ -34,13 +34,15 @@ MOST_ROUNDS = 60
 # Friction that takes a smaller share of the speed in one step is followed by the middle of it.
 GENTLE = 0.5
 
+# Those of the motors come last: numba takes a record that begins like another for one of its kind,
+# and warns.
 FIELDS: list[tuple[str, type, tuple[int, ...]]] = [
-    *MOTOR_FIELDS,
     ('viscous', float, ()),             # N m s
     ('coulomb', float, ()),             # N m
     ('static_ratio', float, ()),
     ('stribeck_speed', float, ()),      # rad/s
     ('smoothing', float, ()),           # rad/s
+    *MOTOR_FIELDS,
 ]
 
 

@@ -37,6 +37,7 @@ from fourbar_ros.control.axes import (
     NO_HOLD,
     TERMS,
 )
+from fourbar_ros.control.branch import Branch, CROSSED, FOLDED, LINKS_ALONE
 from fourbar_ros.mechanism import assemble, kinetic_energy, Mechanism, reduced_form
 import numpy as np
 from numpy.typing import NDArray
@@ -68,11 +69,12 @@ class Axes:
 
 
 def axes_at(mechanism: Mechanism, angles: Array, rates: Array, parallel: bool,
-            reference_angles: Array | None = None, reference_rates: Array = NONE) -> Axes:
+            reference_angles: Array | None = None, reference_rates: Array = NONE,
+            twins: NDArray[np.int64] = LINKS_ALONE) -> Axes:
     found = Axes(*(np.full(shape, np.nan) for shape in ((3, 4), (2, 2), 3, TERMS)))
     axes_of(angles, rates, angles if reference_angles is None else reference_angles,
-            reference_rates, parallel, np.array([mechanism.constants]), found.rows, found.errors,
-            found.bias, found.terms)
+            reference_rates, parallel, twins, np.array([mechanism.constants]), found.rows,
+            found.errors, found.bias, found.terms)
     return found
 
 
@@ -189,6 +191,73 @@ def test_errors_are_those_of_the_pairs_and_eta_is_what_is_left(
                                err_msg=f'seed {seed}')
     np.testing.assert_allclose(axes.terms[[BRANCH_ANGLE, BRANCH_RATE]], [eta, eta_rate],
                                atol=1e-14, err_msg=f'seed {seed}')
+
+
+# Other branches of a rhombus
+
+def on_other(branch: Branch, phi_a: float, theta: float) -> Array:
+    return branch.spread(np.array([phi_a, phi_a + theta]), np.full(2, branch.apart))
+
+
+@pytest.mark.parametrize('turn', [0.0, 2.0 * pi])
+@pytest.mark.parametrize('theta', [0.0, pi])
+@pytest.mark.parametrize('branch', [FOLDED, CROSSED], ids=lambda branch: branch.name)
+@pytest.mark.parametrize('linkage', ['paper', 'prototype'])
+def test_row_of_eta_on_other_branches_is_what_the_closure_leaves_free(
+    linkage: str, branch: Branch, theta: float, turn: float, mechanism: Mechanism,
+) -> None:
+    """The twins turn apart, joint 3 stays closed; also with a twin a turn ahead."""
+    angles = on_other(branch, 0.4, theta)
+    angles[branch.followers[1]] += turn
+    axes = axes_at(mechanism, angles, NONE, True, twins=branch.twins)
+    free = axes.rows[2]
+    for axis, (first, second) in enumerate(branch.pairs):
+        assert abs(free[second] - free[first]) == 1.0
+        np.testing.assert_array_equal(np.flatnonzero(axes.rows[axis]), sorted((first, second)))
+    np.testing.assert_allclose(axes.rows[:2] @ free, 0.0, atol=1e-16)
+    arms = np.array([-1.0, 1.0, 1.0, -1.0]) * mechanism.link_lengths
+    assert abs((arms * free) @ np.exp(1j * angles)) < 1e-16
+    assert axes.terms[HOLD] == pytest.approx(1.0)
+
+
+@each_seed
+@pytest.mark.parametrize('linkage', ['paper', 'prototype'])
+def test_on_the_crossed_branch_it_is_the_reduced_form(
+    seed: int, linkage: str, mechanism: Mechanism,
+) -> None:
+    """Whose axes are links a and b, too; the tolerances are those of the parallelogram."""
+    rng = np.random.default_rng(seed)
+    theta = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, pi - 0.3)
+    angles = on_other(CROSSED, rng.uniform(-3.0, 3.0), theta)
+    rates = CROSSED.spread(rng.uniform(-2, 2, 2), np.zeros(2))
+    form = reduced_form(mechanism, angles, rates)
+    axes = axes_at(mechanism, angles, rates, True, twins=CROSSED.twins)
+    scale = np.abs(form.mass_matrix).max()
+    np.testing.assert_allclose(axes.matrix, form.mass_matrix, atol=1e-14 * scale,
+                               err_msg=f'seed {seed}')
+    np.testing.assert_allclose(axes.bias[:2], form.bias, atol=1e-12 * scale * 4.0,
+                               err_msg=f'seed {seed}')
+    np.testing.assert_allclose(axes.rows[:2], form.wheel_map, atol=1e-13, err_msg=f'seed {seed}')
+
+
+@each_seed
+@pytest.mark.parametrize('linkage', ['paper', 'prototype'])
+def test_folded_and_crossed_branch_are_the_same_for_identical_links(
+    seed: int, linkage: str, mechanism: Mechanism,
+) -> None:
+    """Two bars of twins on one hinge, at their far ends or their near ones: turned by pi."""
+    rng = np.random.default_rng(seed)
+    phi, theta = rng.uniform(-3.0, 3.0, 2)
+    rates = rng.uniform(-2.0, 2.0, 2)
+    folded, crossed = (
+        axes_at(mechanism, on_other(branch, phi, theta + branch.apart),
+                branch.spread(rates, np.zeros(2)), True, twins=branch.twins)
+        for branch in (FOLDED, CROSSED))
+    scale = np.abs(folded.matrix).max()
+    np.testing.assert_allclose(crossed.matrix, folded.matrix, atol=1e-14 * scale,
+                               err_msg=f'seed {seed}')
+    np.testing.assert_allclose(crossed.bias[:2], folded.bias[:2], atol=1e-14 * scale * 4.0,
+                               err_msg=f'seed {seed}')
 
 
 def test_hold_is_full_at_change_points_and_fades_without_a_corner() -> None:

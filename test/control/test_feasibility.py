@@ -18,6 +18,7 @@ from dataclasses import replace
 from math import pi
 import re
 
+from fourbar_ros.control.branch import LINKS_ALONE, on_parallelogram
 from fourbar_ros.control.feasibility import (
     check_needs,
     LEAST_DURATION,
@@ -29,7 +30,7 @@ from fourbar_ros.control.feasibility import (
     Wheels,
 )
 from fourbar_ros.control.reference import SoftStep, Way
-from fourbar_ros.control.setpoint import angles_along, on_parallelogram, SetpointError
+from fourbar_ros.control.setpoint import angles_along, SetpointError
 from fourbar_ros.control.trajectory import Point, read_trajectory
 from fourbar_ros.mechanism import (
     angular_momentum,
@@ -99,8 +100,8 @@ def loads(mechanism: Mechanism, way: Way, wheels: Wheels, times: Array
     present = present_at(mechanism, way)
     angles = angles_along(mechanism, motion[:, 0], present)
     torques, gained, _ = wheel_loads(
-        times, angles, motion[:, 1:], on_parallelogram(mechanism, present), wheels.mobilities,
-        np.array([mechanism.constants]))
+        times, angles, motion[:, 1:], on_parallelogram(mechanism, present), LINKS_ALONE,
+        wheels.mobilities, np.array([mechanism.constants]))
     return angles, torques, wheels.speeds + gained
 
 

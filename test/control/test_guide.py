@@ -41,7 +41,7 @@ def moving_guide(mechanism: Mechanism, angles: Array, travel: Array, duration: f
     guide = Guide(mechanism)
     guide.begin(angles)
     step = SoftStep(guide.motion.copy(), guide.motion[0] + travel, duration)
-    guide.go(step, follow(mechanism, step, guide.angles, crossing=guide.parallel)[-1], 10 ** 9)
+    guide.go(step, follow(mechanism, step, guide.angles, crossing=guide.paired)[-1], 10 ** 9)
     now = 10 ** 9
     for _ in range(round(seconds / PERIOD)):
         now += PERIOD_NS
@@ -75,7 +75,7 @@ def test_it_stands_where_the_links_are(uneven: Mechanism) -> None:
     guide.begin(angles)
     np.testing.assert_array_equal(guide.angles, angles)
     np.testing.assert_array_equal(guide.destination, angles)
-    assert not guide.parallel
+    assert not guide.paired
     assert not guide.moving
     assert guide.goal is None
     assert not guide.motion[1:].any()
@@ -93,7 +93,7 @@ def test_pairs_are_parallel_on_whatever_turns_they_are(
     turns = 2.0 * pi * np.array([0, 0, turns_c, turns_d])
     measured = 0.4 + np.array([0.0, theta, 0.0, theta]) + off + turns
     guide.begin(measured)
-    assert guide.parallel
+    assert guide.paired
     np.testing.assert_allclose(
         guide.angles[2:] - guide.angles[:2], 2.0 * pi * np.array([turns_c, turns_d]), atol=1e-12)
     # The mean of each pair: half of the difference is left.

@@ -23,6 +23,7 @@ from math import pi
 from fourbar_ros.control import ControllerSettings
 from fourbar_ros.control.allocation import AllocationError, ALLOCATIONS
 from fourbar_ros.control.axes import BRANCH_A, BRANCH_B, HOLD, NO_HOLD
+from fourbar_ros.control.branch import Branch, BRANCHES, PARALLELOGRAM
 from fourbar_ros.control.guide import Guide
 from fourbar_ros.control.law import (
     Decision,
@@ -174,6 +175,32 @@ def test_two_wheels_leave_eta_alone(
     np.testing.assert_allclose(0.5 * (given[:2] + given[2:]), planned[:2], rtol=1e-10)
 
 
+@pytest.mark.parametrize('branch', BRANCHES[1:], ids=lambda branch: branch.name)
+@pytest.mark.parametrize('linkage', ['paper', 'prototype'])
+@each_seed
+def test_twins_of_other_branches_accelerate_exactly_as_asked(
+    seed: int, linkage: str, branch: Branch, request: pytest.FixtureRequest,
+    accelerations: Accelerations,
+) -> None:
+    rng = np.random.default_rng(seed)
+    mechanism = without_limits(request.getfixturevalue(linkage))
+    theta = rng.choice([rng.uniform(0.4, 2.7), rng.uniform(0.05, 0.3), pi - 0.05])
+    phi, apart = rng.uniform(-3.0, 3.0), np.full(2, branch.apart)
+    angles = branch.spread(np.array([phi, phi + theta]), apart)
+    rates, behind, planned = (branch.spread(rng.uniform(-size, size, 2), np.zeros(2))
+                              for size in (1.0, 0.05, 2.0))
+    guide = guide_at(mechanism, angles, NONE, planned)
+    guide.branch = branch
+    guide.angles = angles + behind
+    found = decide(law_of(mechanism, wheel_target='zero'), guide, angles, rates,
+                   speeds=rng.uniform(-100.0, 100.0, 4))
+    asked = planned - DAMPING * rates + STIFFNESS * behind
+    # As on the parallelogram, next to a change point joint forces make much of rounding.
+    np.testing.assert_allclose(
+        accelerations(mechanism, angles, rates, found.torques), asked, rtol=1e-7, atol=1e-7,
+        err_msg=f'seed {seed}')
+
+
 @pytest.mark.parametrize('usable', [4, 3])
 @pytest.mark.parametrize('linkage', ['paper', 'parallelogram'])
 def test_torques_change_without_a_corner_where_the_hold_fades(
@@ -188,7 +215,7 @@ def test_torques_change_without_a_corner_where_the_hold_fades(
         for theta in np.linspace(0.02, np.arcsin(NO_HOLD) + 0.1, count):
             angles = np.array([0.0, theta, 0.0, theta])
             guide = guide_at(mechanism, angles + [0.01, -0.02, 0.005, 0.01], NONE, NONE)
-            guide.parallel = True
+            guide.branch = PARALLELOGRAM
             torques.append(decide(law, guide, angles, NONE,
                                   speeds=np.array([50.0, -20.0, 10.0, 80.0])).torques.copy())
         return float(np.abs(np.diff(torques, 2, axis=0)).max())

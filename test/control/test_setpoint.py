@@ -20,12 +20,12 @@ from math import inf, nan, pi
 from typing import Any
 
 from fourbar_ros.control import SetpointError
+from fourbar_ros.control.branch import on_parallelogram
 from fourbar_ros.control.reference import SoftStep
 from fourbar_ros.control.setpoint import (
     CHANGE_POINT_MARGIN,
     check_names,
     follow,
-    on_parallelogram,
     plan,
 )
 from fourbar_ros.mechanism import (

@@ -1,0 +1,189 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Branches on which the links turn in two pairs, and where one meets another.
+
+Where opposite links are equally long, a turns with c and b with d: the parallelogram. Where all
+four are, there are two more. On the folded branch joint 4 lies on joint 2, and a turns with b and
+c with d; on the crossed branch joint 3 lies on joint 1, and a turns with d and b with c. Where all
+links are in line, two branches meet: the change points (docs/mechanics.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import pi, sin
+
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.angles import wrap
+from fourbar_ros.mechanism.constants import Array
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+# Lengths that differ by less than this, relative to their mean, are equal.
+EQUAL_LENGTHS = 1e-9
+
+# Links of a pair as close to their angle as this are taken to be on the branch [rad]: six times
+# what a sensor of 0.1 deg is off. Another branch comes as close only where it meets it.
+ON_BRANCH = 0.01
+
+# Pairs as close to in line as this are at a change point [rad].
+IN_LINE = 1e-3
+
+
+@dataclass(frozen=True)
+class Branch:
+    """
+    A branch on which the links turn in two pairs.
+
+    :param name: of the branch.
+    :param pairs: of link indices; link a is first in the first.
+    :param apart: by how much the second link of each pair is turned against the first [rad].
+    :ivar twins: (4,) the same as kernels take it: first links of both pairs, then second links.
+    :ivar axes: first links of both pairs, after which the axes are named.
+    """
+
+    name: str
+    pairs: tuple[tuple[int, int], tuple[int, int]]
+    apart: float
+    twins: NDArray[np.int64] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        (p1, p2), (q1, q2) = self.pairs
+        object.__setattr__(self, 'twins', np.array([p1, q1, p2, q2], dtype=np.int64))
+
+    @property
+    def axes(self) -> list[int]:
+        """Return the first links of both pairs."""
+        return [self.pairs[0][0], self.pairs[1][0]]
+
+    @property
+    def followers(self) -> list[int]:
+        """Return the second links of both pairs."""
+        return [self.pairs[0][1], self.pairs[1][1]]
+
+    def axis_of(self, link: int) -> int:
+        """Return 0 or 1, the pair to which a link belongs."""
+        return int(link in self.pairs[1])
+
+    def offsets(self, angles: Array) -> Array:
+        """
+        Work out by how much second links are ahead of first ones, whole turns included.
+
+        :param angles: (4,) of the links, on the branch or close to it [rad].
+        :returns: (2,) [rad].
+        """
+        ahead = angles[self.followers] - angles[self.axes]
+        turns: Array = np.round((ahead - self.apart) / (2.0 * pi))
+        return self.apart + 2.0 * pi * turns
+
+    def spread(self, path: Array, offsets: Array) -> Array:
+        """
+        Complete angles of the two axes to those of the links: (..., 2) to (..., 4) [rad].
+
+        :param offsets: (2,) see :meth:`offsets`.
+        """
+        angles = np.empty((*path.shape[:-1], 4))
+        angles[..., self.axes] = path
+        angles[..., self.followers] = path + offsets
+        return angles
+
+    def nearest(self, angles: Array) -> Array:
+        """Return the angles of the links on the branch that are nearest to given ones (4,)."""
+        offsets = self.offsets(angles)
+        ahead = angles[self.followers] - angles[self.axes]
+        return self.spread(angles[self.axes] + 0.5 * (ahead - offsets), offsets)
+
+    def contains(self, mechanism: Mechanism, angles: Array) -> bool:
+        """Tell whether the linkage has this branch and is on it, within `ON_BRANCH` (4,)."""
+        ahead = (angles[self.followers] - angles[self.axes]).tolist()
+        return (all(abs(wrap(angle - self.apart)) < ON_BRANCH for angle in ahead)
+                and (opposite_links_equal(mechanism) if self == PARALLELOGRAM
+                     else is_rhombus(mechanism)))
+
+
+PARALLELOGRAM = Branch('parallelogram', ((0, 2), (1, 3)), 0.0)
+FOLDED = Branch('folded', ((0, 1), (2, 3)), 0.0)
+CROSSED = Branch('crossed', ((0, 3), (1, 2)), pi)
+
+BRANCHES = (PARALLELOGRAM, FOLDED, CROSSED)
+"""All of them; where two meet, the first is assumed."""
+
+LINKS_ALONE: NDArray[np.int64] = PARALLELOGRAM.twins
+"""What stands for the twins where links do not turn in pairs: links a and b are the axes."""
+
+
+def opposite_links_equal(mechanism: Mechanism) -> bool:
+    """Tell whether opposite links are equally long, so that there is a parallelogram."""
+    lengths = mechanism.link_lengths
+    limit = EQUAL_LENGTHS * float(lengths.mean())
+    return bool(np.abs(lengths[:2] - lengths[2:]).max() <= limit)
+
+
+def is_rhombus(mechanism: Mechanism) -> bool:
+    """Tell whether all links are equally long, so that there are all branches."""
+    lengths = mechanism.link_lengths
+    return bool(np.ptp(lengths) <= EQUAL_LENGTHS * float(lengths.mean()))
+
+
+def on_parallelogram(mechanism: Mechanism, link_angles: ArrayLike) -> bool:
+    """
+    Tell whether the linkage is on the parallelogram branch.
+
+    There opposite links stay parallel, and a way leads through change points. Close to one the
+    branches cannot be told apart, and the parallelogram is assumed.
+
+    :param link_angles: (4,) any turns [rad].
+    :returns: True where opposite links are equally long and parallel within `ON_BRANCH`.
+    """
+    return PARALLELOGRAM.contains(mechanism, np.asarray(link_angles, dtype=float))
+
+
+def branch_at(mechanism: Mechanism, link_angles: ArrayLike, *, choosing: bool = False
+              ) -> Branch | None:
+    """
+    Tell on which branch the linkage is.
+
+    :param link_angles: (4,) any turns [rad].
+    :param choosing: whether others than the parallelogram come into question.
+    :returns: None where links do not turn in pairs.
+    """
+    angles = np.asarray(link_angles, dtype=float)
+    for branch in BRANCHES if choosing else BRANCHES[:1]:
+        if branch.contains(mechanism, angles):
+            return branch
+    return None
+
+
+def at_change_point(branch: Branch, angles: Array) -> bool:
+    """Tell whether all links of a linkage on a branch are in line, within `IN_LINE` (4,)."""
+    first, second = branch.axes
+    return abs(sin(angles[second] - angles[first])) < IN_LINE
+
+
+def met_at(mechanism: Mechanism, branch: Branch, angles: Array) -> Branch | None:
+    """
+    Find the branch that meets another at a change point.
+
+    :param branch: on which the linkage is.
+    :param angles: (4,) of the links [rad].
+    :returns: None away from change points, and where links are not equally long.
+    """
+    if not at_change_point(branch, angles):
+        return None
+    for other in BRANCHES:
+        if other != branch and other.contains(mechanism, angles):
+            return other
+    return None

@@ -1,0 +1,107 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Branches are where the loop closes, and two meet where all links are in line."""
+
+from __future__ import annotations
+
+from math import pi
+
+from fourbar_ros.control.branch import (
+    Branch,
+    branch_at,
+    BRANCHES,
+    CROSSED,
+    FOLDED,
+    met_at,
+    on_parallelogram,
+    PARALLELOGRAM,
+)
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.angles import wrap_angles
+from fourbar_ros.mechanism.closure import branch_of, closure_error
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+Array = NDArray[np.float64]
+
+SEEDS = range(10)
+
+each_seed = pytest.mark.parametrize('seed', SEEDS)
+each_branch = pytest.mark.parametrize('branch', BRANCHES, ids=lambda branch: branch.name)
+
+# Where two branches meet, by the angle between their pairs.
+MEETINGS = (
+    (PARALLELOGRAM, 0.0, FOLDED, 0.0), (PARALLELOGRAM, pi, CROSSED, pi), (FOLDED, pi, CROSSED, 0.0),
+)
+
+
+def pose(branch: Branch, heading: float, theta: float) -> Array:
+    return branch.spread(np.array([heading, heading + theta]), np.full(2, branch.apart))
+
+
+@each_branch
+@each_seed
+def test_loop_closes_all_along_it(seed: int, branch: Branch, paper: Mechanism) -> None:
+    """Angles and rates: no gap opens, whatever the pairs do."""
+    rng = np.random.default_rng(seed)
+    angles = pose(branch, *rng.uniform(-3.0, 3.0, 2))
+    rates = branch.spread(rng.uniform(-1.0, 1.0, 2), np.zeros(2))
+    assert closure_error(paper, angles) < 1e-15, f'seed {seed}'
+    arms = np.array([-1.0, 1.0, 1.0, -1.0]) * paper.link_lengths
+    assert abs((arms * rates) @ np.exp(1j * angles)) < 1e-15, f'seed {seed}'
+
+
+@each_branch
+def test_it_has_the_name_that_the_closure_gives_it(branch: Branch) -> None:
+    names = {'parallelogram': 'open'}
+    assert branch_of(pose(branch, 0.3, 0.9)) == names.get(branch.name, branch.name)
+
+
+@each_branch
+@each_seed
+def test_turns_and_noise_do_not_hide_it(seed: int, branch: Branch, paper: Mechanism) -> None:
+    rng = np.random.default_rng(seed)
+    exact = pose(branch, 0.4, rng.uniform(0.1, pi - 0.1)) + 2.0 * pi * rng.integers(-2, 3, 4)
+    measured = exact + rng.uniform(-4e-3, 4e-3, 4)
+    assert branch_at(paper, measured, choosing=True) == branch, f'seed {seed}'
+    near = branch.nearest(measured)
+    # On the branch, on the same turns, and no farther than the mean of two errors.
+    assert closure_error(paper, near) < 1e-15
+    assert np.abs(near - exact).max() <= 4e-3
+    off = measured - near
+    np.testing.assert_allclose(off[branch.axes], -off[branch.followers], atol=1e-14)
+
+
+@pytest.mark.parametrize(('one', 'theta', 'other', 'theta_there'), MEETINGS)
+def test_two_meet_where_all_links_are_in_line(
+    one: Branch, theta: float, other: Branch, theta_there: float, paper: Mechanism,
+    parallelogram: Mechanism,
+) -> None:
+    angles = pose(one, 0.3, theta)
+    assert np.abs(wrap_angles(angles - pose(other, 0.3, theta_there))).max() < 1e-14
+    assert met_at(paper, one, angles) == other
+    assert met_at(paper, other, angles) == one
+    assert met_at(paper, one, pose(one, 0.3, theta + 2e-3)) is None
+    assert met_at(parallelogram, PARALLELOGRAM, angles) is None
+
+
+def test_only_a_rhombus_has_all(paper: Mechanism, parallelogram: Mechanism) -> None:
+    for branch in BRANCHES[1:]:
+        angles = pose(branch, 0.3, 0.9)
+        assert branch_at(paper, angles) is None
+        assert branch_at(paper, angles, choosing=True) == branch
+        assert branch_at(parallelogram, angles, choosing=True) is None
+    assert on_parallelogram(parallelogram, pose(PARALLELOGRAM, 0.3, 0.9))

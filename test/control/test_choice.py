@@ -1,0 +1,180 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Setpoints that name the other branch at a change point are taken, and only there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import pi
+from typing import Any
+
+from fourbar_ros.control import SetpointError
+from fourbar_ros.control.trajectory import Point
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.angles import wrap_angles
+from fourbar_ros.mechanism.closure import closure_error
+import numpy as np
+import pytest
+
+Drive = Callable[..., Any]
+
+ALL = ('link_a', 'link_b', 'link_c', 'link_d')
+PERIOD = 4e-3
+
+
+def standing(drive: Drive, theta: float = 0.0, **settings: Any) -> Any:
+    """Make a controller that stands on the parallelogram, at a change point too."""
+    driven = drive(armed=False, **settings)
+    driven.angles = np.array([0.0, theta, 0.0, theta])
+    driven.controller.device_armed(True)
+    driven.tick()
+    return driven
+
+
+def go(driven: Any, names: Sequence[str], positions: Sequence[float]) -> None:
+    """Make a move, the loop staying closed and the reference continuous, and rest."""
+    driven.controller.setpoint(names, positions)
+    before = driven.angles
+    for _ in range(round(driven.controller.settings.setpoint_duration / PERIOD) + 2):
+        angles = driven.tick().reference_angles
+        # Half a turn in 2 s, and what the change of branch takes.
+        assert np.abs(angles - before).max() < 1e-3 + 1.875 * pi / 2.0 * PERIOD
+        assert closure_error(driven.controller.mechanism, angles) < 1e-14
+        before = angles
+    assert driven.controller.mode == 'hold'
+
+
+@pytest.mark.parametrize('names', [ALL, ('link_a', 'link_c'), ('link_b', 'link_d')])
+def test_out_on_the_folded_branch_and_back(names: Sequence[str], drive: Drive) -> None:
+    """Two named links are enough if they tell the branch."""
+    driven = standing(drive, 0.0, change_points='choose', setpoint_duration=2.0)
+    assert driven.controller.branch == 'parallelogram'
+    goal = dict(zip(ALL, (0.1, 0.1, 0.6, 0.6)))
+    go(driven, names, [goal[name] for name in names])
+    assert driven.controller.branch == 'folded'
+    np.testing.assert_allclose(driven.angles, [0.1, 0.1, 0.6, 0.6], atol=1e-12)
+    # On it, one link turns its pair.
+    go(driven, ['link_d'], [0.4])
+    np.testing.assert_allclose(driven.angles, [0.1, 0.1, 0.4, 0.4], atol=1e-12)
+    go(driven, ['link_c', 'link_b'], [0.2, 0.2])
+    np.testing.assert_allclose(driven.angles, np.full(4, 0.2), atol=1e-12)
+    go(driven, ALL, (0.2, 0.5, 0.2, 0.5))
+    assert driven.controller.branch == 'parallelogram'
+    np.testing.assert_allclose(driven.angles, [0.2, 0.5, 0.2, 0.5], atol=1e-12)
+
+
+def test_round_through_all_three_branches(drive: Drive) -> None:
+    """Parallelogram, folded, crossed and back, each by the change point where they meet."""
+    driven = standing(drive, 0.0, change_points='choose', setpoint_duration=4.0)
+    go(driven, ALL, (0.0, 0.0, 1.0, 1.0))
+    go(driven, ALL, (0.0, 0.0, pi, pi))
+    assert driven.controller.branch == 'folded'
+    go(driven, ALL, (0.0, 1.0, 1.0 + pi, pi))
+    assert driven.controller.branch == 'crossed'
+    go(driven, ALL, (0.0, pi, 2.0 * pi, pi))
+    go(driven, ALL, (0.0, 2.0, 0.0, 2.0))
+    assert driven.controller.branch == 'parallelogram'
+    np.testing.assert_allclose(wrap_angles(driven.angles - np.array([0, 2, 0, 2])), 0.0,
+                               atol=1e-9)
+
+
+def test_what_fits_on_the_present_branch_stays_on_it(drive: Drive) -> None:
+    """A single link, or two that mean either branch."""
+    for names, positions in ((['link_c'], [0.5]), (['link_a', 'link_d'], [0.0, 0.5])):
+        driven = standing(drive, 0.0, change_points='choose', setpoint_duration=2.0)
+        go(driven, names, positions)
+        assert driven.controller.branch == 'parallelogram'
+
+
+@pytest.mark.parametrize(('change_points', 'theta', 'names', 'positions', 'reason'), [
+    ('keep', 0.0, ('link_a', 'link_c'), (0.0, 0.5),
+     'on the folded branch, which change_points: choose would allow'),
+    ('keep', pi, ALL, (0.0, pi + 0.5, 0.5, pi),
+     'on the crossed branch, which change_points: choose would allow'),
+    ('choose', 0.0, ALL, (0.0, 0.2, 0.5, 0.5), 'do not fit together on this branch$'),
+    ('choose', 0.0, ('link_a', 'link_c'), (0.3, 0.3), 'do not determine the configuration$'),
+    ('choose', 0.5, ('link_a', 'link_c'), (0.0, 0.5), 'only where the reference rests at a change'),
+    ('choose', 2e-3, ('link_a', 'link_c'), (0.0, 0.5), 'at a change point, within 0.001 rad'),
+], ids=range(6))
+def test_it_is_refused_with_the_reason(
+    change_points: str, theta: float, names: Sequence[str], positions: Sequence[float],
+    reason: str, drive: Drive,
+) -> None:
+    driven = standing(drive, theta, change_points=change_points)
+    before = driven.tick().reference_angles
+    with pytest.raises(SetpointError, match=reason):
+        driven.controller.setpoint(names, positions)
+    assert driven.controller.branch == 'parallelogram'
+    assert driven.controller.last_refusal
+    np.testing.assert_array_equal(driven.tick().reference_angles, before)
+
+
+def test_while_it_moves_it_is_refused(drive: Drive) -> None:
+    driven = standing(drive, -0.5, change_points='choose', setpoint_duration=4.0)
+    driven.controller.setpoint(['link_b'], [0.5])
+    for _ in range(500):
+        control = driven.tick()
+    assert abs(control.reference_angles[1]) < 1e-2
+    with pytest.raises(SetpointError, match='only where the reference rests'):
+        driven.controller.setpoint(['link_a', 'link_c'], [0.0, 0.5])
+
+
+def test_on_the_folded_branch_links_of_a_pair_do_not_come_apart(drive: Drive) -> None:
+    driven = standing(drive, 0.0, change_points='choose', setpoint_duration=2.0)
+    go(driven, ALL, (0.0, 0.0, 0.5, 0.5))
+    with pytest.raises(SetpointError, match='folded branch, where they turn together'):
+        driven.controller.setpoint(['link_a', 'link_b'], [0.0, 0.5])
+
+
+def test_links_of_two_lengths_have_no_other_branch(
+    drive: Drive, parallelogram: Mechanism,
+) -> None:
+    driven = standing(drive, mechanism=parallelogram, change_points='choose')
+    with pytest.raises(SetpointError, match=r'links of one length, here [0-9.]+ to [0-9.]+ m'):
+        driven.controller.setpoint(['link_a', 'link_c'], [0.0, 0.5])
+
+
+def test_what_the_wheels_cannot_give_is_refused_there_too(drive: Drive) -> None:
+    driven = standing(drive, 0.0, change_points='choose', setpoint_duration=0.1)
+    with pytest.raises(SetpointError, match=r'needs .* on flywheel_'):
+        driven.controller.setpoint(['link_a', 'link_c'], [0.0, 1.0])
+    assert driven.controller.branch == 'parallelogram'
+    driven = standing(drive, 0.0, change_points='choose', setpoint_timing='shortest')
+    driven.controller.setpoint(['link_a', 'link_c'], [0.0, 1.0])
+    assert driven.controller.branch == 'folded'
+
+
+def test_trajectories_go_along_the_branch(drive: Drive) -> None:
+    """Named rates are those of the pair, and one named link leaves the other pair alone."""
+    driven = standing(drive, 0.0, change_points='choose', setpoint_duration=2.0)
+    go(driven, ALL, (0.0, 0.0, 0.5, 0.5))
+    driven.controller.trajectory(
+        ['link_d'], [Point([0.7], 2.0, [0.1]), Point([0.9], 4.0)])
+    for tick in range(1002):
+        control = driven.tick()
+        assert closure_error(driven.controller.mechanism, control.reference_angles) < 1e-14
+        if abs(tick - 500) <= 1:
+            # A tick later or sooner, the rate has changed by what 1 rad/s^2 does.
+            np.testing.assert_allclose(control.reference_rates, [0.0, 0.0, 0.1, 0.1], atol=PERIOD)
+    np.testing.assert_allclose(driven.angles, [0.0, 0.0, 0.9, 0.9], atol=1e-12)
+
+
+def test_armed_on_another_branch_it_holds_there(drive: Drive) -> None:
+    """With `choose` it knows the branches; else it is the reduced form that holds."""
+    for change_points, branch in (('choose', 'crossed'), ('keep', 'crossed')):
+        driven = drive(phi_b=1.0, branch='crossed', change_points=change_points)
+        assert driven.controller.branch == branch
+        before = driven.angles
+        np.testing.assert_allclose(driven.tick().reference_angles, before, atol=1e-12)
