@@ -223,13 +223,8 @@ class Controller:
             if self.settings.setpoint_timing == 'shortest':
                 step = self._shortest(step, present, branch)
             else:
-<<<<<<< HEAD
-                check_needs(self.mechanism, step, guide.angles,
-                            self._wheels_after(step.duration), crossing=crossing)
-=======
                 check_needs(self.mechanism, step, present, self._wheels_after(step.duration),
-                            share=self.law.share, crossing=self._crossing, branch=branch)
->>>>>>> f340377db8a070c3efa1731b9d215618eeb2e26b
+                            crossing=self._crossing, branch=branch)
         except SetpointError as error:
             self._refuse(error, was)
             raise
@@ -257,11 +252,7 @@ class Controller:
                 self.mechanism, names, points, guide.motion.copy(), guide.angles,
                 guide.destination, crossing=crossing, branch=guide.branch)
             check_needs(self.mechanism, way, guide.angles, self._wheels_after(way.duration),
-<<<<<<< HEAD
-                        crossing=crossing)
-=======
-                        share=self.law.share, crossing=crossing, branch=guide.branch)
->>>>>>> f340377db8a070c3efa1731b9d215618eeb2e26b
+                        crossing=crossing, branch=guide.branch)
         except SetpointError as error:
             self._refuse(error, was)
             raise
@@ -410,14 +401,9 @@ class Controller:
         left = guide.time_left(self._stamp_ns)
         try:
             shortest = shortest_duration(
-<<<<<<< HEAD
-                self.mechanism, guide.motion.copy(), goal[:2], guide.angles,
-                self._wheels_after(0.0), crossing=self._crossing)
-=======
                 self.mechanism, guide.motion.copy(), goal[guide.axes], guide.angles,
-                self._wheels_after(0.0), share=self.law.share, crossing=self._crossing,
+                self._wheels_after(0.0), crossing=self._crossing,
                 branch=guide.branch)
->>>>>>> f340377db8a070c3efa1731b9d215618eeb2e26b
             if shortest > left:
                 move = SoftStep(guide.motion.copy(), goal[guide.axes], shortest)
                 follow(self.mechanism, move, guide.angles, crossing=self._crossing,
@@ -448,13 +434,8 @@ class Controller:
 
     def _shortest(self, move: SoftStep, present: Array, branch: Branch | None) -> SoftStep:
         duration = shortest_duration(
-<<<<<<< HEAD
-            self.mechanism, move.start, move.goal, guide.angles, self._wheels_after(0.0),
-            crossing=self._crossing)
-=======
             self.mechanism, move.start, move.goal, present, self._wheels_after(0.0),
-            share=self.law.share, crossing=self._crossing, branch=branch)
->>>>>>> f340377db8a070c3efa1731b9d215618eeb2e26b
+            crossing=self._crossing, branch=branch)
         shortest = SoftStep(move.start, move.goal, duration)
         follow(self.mechanism, shortest, present, crossing=self._crossing, branch=branch)
         return shortest
