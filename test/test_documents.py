@@ -25,7 +25,7 @@ from fourbar_ros.commands.main import COMMANDS
 from fourbar_ros.configuration import config_file, load_yaml
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism
-from fourbar_ros.nodes.tables import markdown_text, yaml_text
+from fourbar_ros.nodes.tables import markdown_text, prototype_text, yaml_text
 from fourbar_ros.plant.faults import FaultKind, SENSOR_FAULTS, WHEEL_FAULTS
 from fourbar_ros.plant.ledger import Ledger
 from fourbar_ros.plant.schedule import parse_schedule, read_schedule
@@ -44,6 +44,11 @@ def test_parameter_tables_are_those_of_the_nodes() -> None:
 def test_parameters_file_is_that_of_the_nodes() -> None:
     """Regenerate with `python -m fourbar_ros.nodes.tables > config/nodes.yaml`."""
     assert (ROOT / 'config' / 'nodes.yaml').read_text() == yaml_text()
+
+
+def test_parameters_file_of_the_prototype_is_that_of_its_scenario() -> None:
+    """Regenerate with `python -m fourbar_ros.nodes.tables --prototype`, and so on."""
+    assert (ROOT / 'config' / 'nodes_prototype.yaml').read_text() == prototype_text()
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)

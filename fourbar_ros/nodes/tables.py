@@ -16,13 +16,14 @@
 The parameter tables of all nodes, and the files made from them.
 
 `python -m fourbar_ros.nodes.tables` writes config/nodes.yaml to standard output, with
-`--markdown` the tables of docs/topics.md.
+`--markdown` the tables of docs/topics.md, and with `--prototype` config/nodes_prototype.yaml.
 """
 
 import sys
 
 from fourbar_ros.control.parameters import PARAMETERS as CONTROLLER_PARAMETERS
 from fourbar_ros.estimation.parameters import PARAMETERS as ESTIMATOR_PARAMETERS
+from fourbar_ros.loop import load_scenario
 from fourbar_ros.nodes import plant
 
 TABLES = {
@@ -41,6 +42,22 @@ def yaml_text():
         for row in table:
             unit = f' [{row.unit}]' if row.unit else ''
             lines.append(f'    {row.name}: {_scalar(row.default)}  # {row.meaning}{unit}')
+    return '\n'.join(lines) + '\n'
+
+
+def prototype_text():
+    """Write a parameters file that makes all nodes run as the prototype's scenario has it."""
+    scenario = load_scenario('prototype')
+    lines = ['# Parameters of all nodes for the bench-scale linkage, where they are not the defaults.',
+             '# As in scenario_prototype.yaml. The keys hold in any namespace.']
+    for node, values in scenario.parameters().items():
+        lines += ['', f'/**/{node}:', '  ros__parameters:']
+        for row in TABLES[node]:
+            if row.name.startswith('initial.'):
+                continue
+            if values.get(row.name, row.default) != row.default:
+                unit = f' [{row.unit}]' if row.unit else ''
+                lines.append(f'    {row.name}: {_scalar(values[row.name])}  # {row.meaning}{unit}')
     return '\n'.join(lines) + '\n'
 
 
@@ -77,4 +94,5 @@ def _scalar(value):
 
 
 if __name__ == '__main__':
-    sys.stdout.write(markdown_text() if '--markdown' in sys.argv else yaml_text())
+    text = {'--markdown': markdown_text, '--prototype': prototype_text}
+    sys.stdout.write(text.get(sys.argv[-1], yaml_text)())
