@@ -301,20 +301,17 @@ def wheel_loads(times: Array, angles: Array, motion: Array, paired: bool,
     for axis in range(2):
         wheel_map[twins[axis], axis] = wheel_map[twins[axis + 2], axis] = 1.0
     for n in range(count):
-        if paired:
-            for wheel in range(4):
-                link_rates[n, wheel] = (wheel_map[wheel, 0] * motion[n, 0, 0]
-                                        + wheel_map[wheel, 1] * motion[n, 0, 1])
-            _, _, a00, a01, a11, b0, b1 = pair_terms(
-                angles[n], (link_rates[n, 0], link_rates[n, 1], link_rates[n, 2],
-                            link_rates[n, 3]), twins, constants[0])
-        else:
+        if not paired:
             a00, a01, a11, b0, b1, g1, g2, g3, g4, _, _ = reduced_terms_at(
                 angles[n], motion[n, 0], constants[0])
             wheel_map[2, 0], wheel_map[2, 1], wheel_map[3, 0], wheel_map[3, 1] = g1, g2, g3, g4
-            for wheel in range(4):
-                link_rates[n, wheel] = (wheel_map[wheel, 0] * motion[n, 0, 0]
-                                        + wheel_map[wheel, 1] * motion[n, 0, 1])
+        for wheel in range(4):
+            link_rates[n, wheel] = (wheel_map[wheel, 0] * motion[n, 0, 0]
+                                    + wheel_map[wheel, 1] * motion[n, 0, 1])
+        if paired:
+            _, _, a00, a01, a11, b0, b1 = pair_terms(
+                angles[n], (link_rates[n, 0], link_rates[n, 1], link_rates[n, 2],
+                            link_rates[n, 3]), twins, constants[0])
         demand_a = a00 * motion[n, 1, 0] + a01 * motion[n, 1, 1] + b0
         demand_b = a01 * motion[n, 1, 0] + a11 * motion[n, 1, 1] + b1
         _solve_shares(wheel_map, mobilities, demand_a, demand_b, share)

@@ -59,8 +59,7 @@ SETTINGS = (
               'errors of the configuration that do nothing at rest, where joints stick',
               limits=(0.0, 0.1), live=True),
     Parameter('change_points', _DEFAULTS.change_points, '',
-              'refuse moves that meet a change point, keep to the branch there, or change it '
-              'there for a setpoint that names the other',
+              'refuse moves that meet a change point, keep to the branch there, or choose it',
               choices=CHANGE_POINTS, live=True),
     Parameter('branch_bandwidth', _DEFAULTS.branch_bandwidth, 'rad/s',
               'natural frequency of the hold on the branch at change points',

@@ -251,7 +251,7 @@ def test_statuses_have_their_keys(testbed):
     assert device['state'] == 'disarmed'
     assert device['mechanism'] == 'paper'
     controller = testbed.status('controller_status')
-    assert {'mode', 'goal', 'last_refusal', 'problem', 'wheel_faults'} < set(controller)
+    assert {'mode', 'goal', 'branch', 'last_refusal', 'problem', 'wheel_faults'} < set(controller)
     assert (controller['mode'], controller['goal']) == ('disarmed', '')
     assert (controller['problem'], controller['wheel_faults']) == ('', '')
 
