@@ -185,6 +185,12 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
     """
     motors, changed = boxed[0], False
     short, long = 1.0 - exp(-period / SHORT), 1.0 - exp(-period / LONG)
+    # Where no motor gives anything, the device does not drive: commands are late, or it is
+    # disarmed and that is not known here yet. No wheel is to blame.
+    driving = False
+    for j in range(4):
+        scale = max(motors.torque_limit[j], FRICTIONS * friction[0])
+        driving |= powered[j] and abs(efforts[j]) > NOTHING * scale
     for j in range(4):
         wheel, before = kept[j], verdicts[j]
         inertia, limit = motors.inertia[j], motors.torque_limit[j]
@@ -205,6 +211,9 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
             changed |= verdicts[j] != before
             continue
         wheel[CUT_FOR] = 0.0
+        if not driving:
+            _wait(wheel, speed)
+            continue
         asked, behind = _follow_model(
             j, wheel, commands[j], by_speed, speed, turned, period, friction, boxed)
         wheel[EXPECTED] += short * (asked - wheel[EXPECTED])
@@ -228,10 +237,16 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
 
 @kernel
 def _without_power(wheel: Array, speed: float, period: float) -> None:
+    _wait(wheel, speed)
+    wheel[CUT_FOR] += period
+
+
+@kernel
+def _wait(wheel: Array, speed: float) -> None:
+    """Let the model follow the wheel, which nobody drives."""
     wheel[MODEL_SPEED], wheel[MODEL_TORQUE], wheel[EXPECTED] = speed, 0.0, 0.0
     wheel[INTEGRAL] = wheel[REPLICA] = nan
     wheel[AGAINST] = wheel[SUSPECT_FOR] = wheel[FAST_FOR] = 0.0
-    wheel[CUT_FOR] += period
 
 
 @kernel

@@ -48,8 +48,8 @@ def yaml_text():
 def prototype_text():
     """Write a parameters file that makes all nodes run as the prototype's scenario has it."""
     scenario = load_scenario('prototype')
-    lines = ['# Parameters of all nodes for the bench-scale linkage that are not the defaults, as in',
-             '# scenario_prototype.yaml. The keys hold in any namespace.']
+    lines = ['# Parameters of all nodes for the bench-scale linkage that are not the defaults.',
+             '# As in scenario_prototype.yaml; the keys hold in any namespace.']
     for node, values in scenario.parameters().items():
         lines += ['', f'/**/{node}:', '  ros__parameters:']
         for row in TABLES[node]:
@@ -57,7 +57,8 @@ def prototype_text():
                 continue
             if values.get(row.name, row.default) != row.default:
                 unit = f' [{row.unit}]' if row.unit else ''
-                lines.append(f'    {row.name}: {_scalar(values[row.name])}  # {row.meaning}{unit}')
+                scalar = _scalar(values[row.name])
+                lines.append(f'    {row.name}: {scalar}  # {row.meaning}{unit}')
     return '\n'.join(lines) + '\n'
 
 

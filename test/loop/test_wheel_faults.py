@@ -190,3 +190,12 @@ def test_nobody_is_named_without_reason(command: str, scenario: Scenario) -> Non
                      command, 0.5)
         assert story.named == {}, f'seed {seed}'
         assert story.final < 0.1, f'seed {seed}'
+
+
+@pytest.mark.parametrize('command', COMMANDS)
+def test_device_that_does_not_drive_is_no_fault_of_its_wheels(
+    command: str, scenario: Scenario,
+) -> None:
+    """All motors dead at once: commands do not arrive, or it is disarmed."""
+    story = tell(scenario, command, 3.0, *(Fault(name, 'dead') for name in FLYWHEEL_NAMES))
+    assert story.named == {}

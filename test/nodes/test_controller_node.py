@@ -87,6 +87,7 @@ def started(nodes, probe):
     probe.follow('reference', 'flywheel_command', 'allocation', 'momentum')
     probe.newest('reference')
     probe.wait(lambda: probe.arm().success)
+    probe.status('controller_status', mode='hold')
     return probe
 
 
