@@ -80,6 +80,8 @@ BEHIND, EXPLAINED_BETTER, VISIBLE = 0.35, 4.0, 5e-4
 # Degradation must last so long to be said [s], and is not looked at while the motor gives more
 # than this share of its limit, nor for so long afterwards [s].
 PERSISTENT, STRAINED, AFTER_STRAIN = 0.5, 0.5, 2.0
+# Nor for so long after another wheel broke [s].
+AFTER_BREAK = 3.0
 
 # The friction of slower wheels is not known [rad/s], nor that of one which was slow so lately [s].
 SLOWEST, AFTER_SLOW = 5.0, 0.8
@@ -187,7 +189,7 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
     short, long = 1.0 - exp(-period / SHORT), 1.0 - exp(-period / LONG)
     # Where no motor gives anything, the device does not drive: commands are late, or it is
     # disarmed and that is not known here yet. No wheel is to blame.
-    driving = False
+    driving = broke = False
     for j in range(4):
         scale = max(motors.torque_limit[j], FRICTIONS * friction[0])
         driving |= powered[j] and abs(efforts[j]) > NOTHING * scale
@@ -232,6 +234,10 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
                 long, gained, friction, boxed, past[j], late[j]):
             verdicts[j] = DEGRADED
         changed |= verdicts[j] != before
+        broke |= before < DEAD <= verdicts[j]
+    if broke:
+        # The others now give what they never gave before.
+        kept[:, SUSPECT_FOR] = -AFTER_BREAK
     return changed
 
 
@@ -297,12 +303,16 @@ def _broken(wheel: Array, speed: float, scale: float, friction: Array) -> int:
     lost = effort - taken - wheel[GAIN]
     dry = friction[0]
     if abs(lost) > max(5.0 * dry, BRAKED * scale) or (
-            abs(speed) < STANDING and abs(effort) > 3.0 * dry + nothing
+            abs(speed) < STANDING and abs(effort) > 1.5 * dry + nothing
             and abs(lost) > 0.5 * abs(effort)):
         return STUCK
     unasked = abs(effort - expected) > UNASKED * scale + 0.5 * abs(expected)
     if unasked and (effort * expected < 0.0 or abs(effort) > 1.3 * abs(expected)):
         return RUNAWAY
+    if (abs(effort - expected) <= MISSING * abs(expected) + nothing
+            and abs(lost) <= FRICTION_LOSS * scale + INERTIA_ERROR * abs(wheel[GAIN])):
+        # The model drifted, as far as its inertia may be wrong.
+        return HEALTHY
     return DEGRADED
 
 
@@ -347,7 +357,8 @@ def _degraded(j: int, wheel: Array, asked: float, by_speed: bool, speed: float, 
                and _rubs(wheel, speed, scale, period))
     # A share of little is no evidence.
     missing &= max(abs(wheel[LONG_EFFORT]), abs(wheel[LONG_EXPECTED])) > LOOKED_AT * scale
-    if wheel[SETTLED] > AFTER_STRAIN and (missing or tardy or rubbing):
+    if wheel[SUSPECT_FOR] < 0.0 or (
+            wheel[SETTLED] > AFTER_STRAIN and (missing or tardy or rubbing)):
         wheel[SUSPECT_FOR] += period
     else:
         wheel[SUSPECT_FOR] = 0.0
