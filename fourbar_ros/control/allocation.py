@@ -408,21 +408,3 @@ def _dot(first: Array, second: Array) -> float:
     for n in range(first.size):
         total += first[n] * second[n]
     return total
-
-
-@kernel
-def minimum_norm(wheel_map: Array, flywheel_inertias: Array, demand: Array) -> Array:
-    """
-    Find the torques with the smallest norm of wheel accelerations (paper eq. 8, corrected).
-
-    With `I_f = -G diag(If)` of eq. 6, `s = I_f^T (I_f I_f^T)^-1 (A du + b)` and `tau = If s`.
-
-    :param wheel_map: G (2, 4).
-    :param flywheel_inertias: If (4,) [kg m^2].
-    :param demand: A du + b (2,) [N m].
-    :returns: (4,) torques on the wheels, whatever the motors can give [N m].
-    """
-    torques, without_limit = np.empty(4), np.full(4, inf)
-    allocate(wheel_map, demand, flywheel_inertias * flywheel_inertias, -without_limit,
-             without_limit, False, torques)
-    return torques

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from math import exp, pi, sin
 
 from fourbar_ros.control.accounts import Accounts, LONGEST_PERIOD
-from fourbar_ros.control.allocation import mobilities
 from fourbar_ros.control.branch import Branch, LINKS_ALONE
 from fourbar_ros.control.choice import choose
 from fourbar_ros.control.drive import WheelCommand, WheelDrive
@@ -424,13 +423,10 @@ class Controller:
 
     def _wheels_after(self, duration: float) -> Wheels:
         """Return the wheels as they are, and what their drift takes in a time [s]."""
-        usable = self.wheels.usable
-        metric = mobilities(
-            self.settings.allocation, self.mechanism.flywheel_inertias, usable)
         speeds = self.speeds + self.momentum.drift * min(duration, 60.0) * (
             np.sign(self.momentum.drift) == np.sign(self.speeds))
         friction = np.full(4, self.settings.bearing_coulomb)
-        return Wheels(speeds, metric, friction, PLANNED * self.law.share)
+        return Wheels(speeds, self.law.mobilities, friction, PLANNED * self.law.share)
 
     def _shortest(self, move: SoftStep, present: Array, branch: Branch | None) -> SoftStep:
         duration = shortest_duration(

@@ -32,12 +32,12 @@ from fourbar_ros.control.axes import (
 )
 from fourbar_ros.control.branch import LINKS_ALONE
 from fourbar_ros.control.guide import Guide
-from fourbar_ros.control.null_space import null_torques, target_speeds
+from fourbar_ros.control.null_space import null_torques, target_speeds, towards
 from fourbar_ros.control.settings import ControllerSettings
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.compiled import kernel
 from fourbar_ros.mechanism.constants import Array
-from fourbar_ros.mechanism.motors import motors_of
+from fourbar_ros.mechanism.motors import available_torque, motors_of
 import numpy as np
 from numpy.typing import NDArray
 
@@ -66,9 +66,8 @@ class Decision:
     :param torques: (4,) that act on wheels and links alike, bearings apart [N m].
     :param planned: (4,) of these, what the reference alone asks for [N m].
     :param rows: (3, 4) G and, where links turn in pairs, the row of eta.
-    :param terms: see tracking.
+    :param terms: see axes.
     :param scale: share of what was asked for that the motors can give.
-    :param hold: how much of the hold on the branch there is.
     :param lower, upper: (4,) what they could give [N m].
     """
 
@@ -79,7 +78,11 @@ class Decision:
     lower: Array = field(default_factory=lambda: np.zeros(4))
     upper: Array = field(default_factory=lambda: np.zeros(4))
     scale: float = 1.0
-    hold: float = 0.0
+
+    @property
+    def hold(self) -> float:
+        """How much of the hold on the branch there is."""
+        return float(self.terms[HOLD])
 
 
 @kernel
@@ -96,13 +99,8 @@ def motor_bounds(speeds: Array, friction: Array, share: float, boxed: NDArray[np
     motors = boxed[0]
     for j in range(4):
         limit = motors.torque_limit[j]
-        low, high = -limit, limit
-        if motors.resistance[j] > 0.0:
-            slope = motors.torque_constant[j] / motors.resistance[j]
-            back = motors.torque_constant[j] * speeds[j]
-            low = max(low, slope * (-motors.voltage[j] - back))
-            high = min(high, slope * (motors.voltage[j] - back))
-        low, high = share * low - friction[j], share * high - friction[j]
+        low = share * available_torque(j, -limit, speeds[j], motors) - friction[j]
+        high = share * available_torque(j, limit, speeds[j], motors) - friction[j]
         gain = motors.inertia[j] / HORIZON
         lower[j] = min(max(low, gain * (-motors.speed_limit[j] - speeds[j])), 0.0)
         upper[j] = max(min(high, gain * (motors.speed_limit[j] - speeds[j])), 0.0)
@@ -159,10 +157,9 @@ def decide(angles: Array, rates: Array, reference_angles: Array, reference_rates
         demand[2] = hold * asked - (1.0 - hold) * present
         scale = allocate(rows, demand, mobilities, lower, upper, bounded, torques)
     if numbers[WHEEL_BANDWIDTH] > 0.0:
-        wanted, free, held = np.empty(4), np.zeros(4), np.zeros(4)
-        for j in range(4):
-            wanted[j] = -boxed[0].flywheel_inertias[j] * numbers[WHEEL_BANDWIDTH] * (
-                speeds[j] - wanted_speeds[j])
+        free, held = np.zeros(4), np.zeros(4)
+        wanted = towards(
+            speeds, wanted_speeds, boxed[0].flywheel_inertias, numbers[WHEEL_BANDWIDTH])
         null_torques(rows[:2], free_mobilities, wanted, lower, upper, torques, free)
         if hold > 0.0:
             null_torques(rows, free_mobilities, wanted, lower, upper, torques, held)
@@ -246,8 +243,13 @@ class TrackingLaw:
             wheel_speeds + rates, numbers, guide.paired, self._twins, self._constants,
             self.mobilities, self._free_mobilities, self._bounded, found.lower, found.upper,
             found.rows, found.terms, found.torques, found.planned)
-        found.hold = float(found.terms[HOLD])
         return found
+
+    @property
+    def axes(self) -> NDArray[np.int64]:
+        """Return the links after which the axes of the last decision are named (2,)."""
+        axes: NDArray[np.int64] = self._twins[:2]
+        return axes
 
     def lost_axes(self) -> list[str]:
         """Name the axes that the wheels can not drive."""

@@ -66,7 +66,7 @@ def momentum_scalars(controller: Controller) -> tuple[tuple[str, ...], Array]:
     absolute = controller.speeds + controller.rates
     held = found.rows[:2] @ (mechanism.flywheel_inertias * absolute)
     a00, a01, a11 = found.terms[[A00, A01, A11]]
-    axes = held + np.array([[a00, a01], [a01, a11]]) @ controller.rates[:2]
+    axes = held + np.array([[a00, a01], [a01, a11]]) @ controller.rates[controller.law.axes]
     left = controller.momentum.time_left(controller.speeds)
     values = np.array([
         angular_momentum(mechanism, controller.angles, controller.rates, absolute), *axes,

@@ -32,6 +32,7 @@ from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.motors import (
     available_torque,
     lagged_torque,
+    Motors,
     motors_of,
     SPEED_BANDWIDTH,
     speed_loop,
@@ -56,13 +57,13 @@ OF_STRAINED, JUST_STRAINED = 10.0, 0.3
 OF_SLOW, SOON = 1.5, 2.0
 
 # Time constants of means [s]: for a wheel that breaks, and for one that degrades; with which a
-# healthy one is learnt, and the model of a wheel that is driven by torque led back to it, since
-# errors of the friction add up there.
+# healthy one is learnt, and models of a wheel and its loop are led back to it, since errors add
+# up there.
 SHORT, LONG, SLOW, VERY_SLOW = 0.02, 0.5, 5.0, 30.0
 
 # In shares of the motor's torque limit, or of so many times its friction if that is more:
-# degradation is looked at from this effort on; torque that
-# friction takes; a motor that gives nothing; one that gives what nobody asked for; a brake.
+# degradation is looked at from this effort on; torque that friction takes; a motor that gives
+# nothing; one that gives what nobody asked for; a brake.
 FRICTIONS = 50.0
 LOOKED_AT, FRICTION_LOSS, NOTHING, UNASKED, BRAKED = 0.04, 8e-4, 2e-3, 0.04, 0.1
 
@@ -70,7 +71,7 @@ LOOKED_AT, FRICTION_LOSS, NOTHING, UNASKED, BRAKED = 0.04, 8e-4, 2e-3, 0.04, 0.1
 # the measured change of torque, by how much the inertia of a wheel may be believed wrongly.
 DEAD_SHARE, MISSING, INERTIA_ERROR = 0.15, 0.2, 0.06
 # Of what a motor's own loop asks for a replica knows less, since it sees the speed less often.
-MISSING_BY_SPEED, REPLICA_SLOW = 0.25, 5.0
+MISSING_BY_SPEED = 0.25
 
 # A wheel that follows speeds is late if it is so far behind on the mean [rad/s]; one that follows
 # torques, if some delay explains its effort better than none by this factor, in squares, and the
@@ -191,12 +192,11 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
     # disarmed and that is not known here yet. No wheel is to blame.
     driving = broke = False
     for j in range(4):
-        scale = max(motors.torque_limit[j], FRICTIONS * friction[0])
-        driving |= powered[j] and abs(efforts[j]) > NOTHING * scale
+        driving |= powered[j] and abs(efforts[j]) > NOTHING * _scale(j, friction, motors)
     for j in range(4):
         wheel, before = kept[j], verdicts[j]
         inertia, limit = motors.inertia[j], motors.torque_limit[j]
-        scale = max(limit, FRICTIONS * friction[0])
+        scale = _scale(j, friction, motors)
         speed, turned = speeds[j], rates[j] - wheel[LAST_RATE]
         gained = speed - wheel[LAST_SPEED]
         gain = inertia * (gained + turned) / period
@@ -239,6 +239,12 @@ def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDAr
         # The others now give what they never gave before.
         kept[:, SUSPECT_FOR] = -AFTER_BREAK
     return changed
+
+
+@kernel
+def _scale(j: int, friction: Array, motors: Motors) -> float:
+    """Return what torques are measured against [N m]."""
+    return float(max(motors.torque_limit[j], FRICTIONS * friction[0]))
 
 
 @kernel
@@ -323,7 +329,7 @@ def _degraded(j: int, wheel: Array, asked: float, by_speed: bool, speed: float, 
               late: Array) -> bool:
     """Tell whether a wheel lacks torque or acts late, for long enough to say so."""
     motors = boxed[0]
-    scale = max(motors.torque_limit[j], FRICTIONS * friction[0])
+    scale = _scale(j, friction, motors)
     if by_speed:
         seen = speed - 0.5 * gained * LOOP_STEP / period
         asked = _replicate(j, wheel, command, seen, effort, period, boxed)
@@ -394,7 +400,7 @@ def _replicate(j: int, wheel: Array, command: float, speed: float, effort: float
     if not abs(wheel[REPLICA]) <= limit or wheel[SETTLED] < AFTER_STRAIN:
         wheel[REPLICA] = effort - SPEED_BANDWIDTH * motors.inertia[j] * (command - speed)
     asked, wheel[REPLICA] = speed_loop(j, command, speed, wheel[REPLICA], period, motors)
-    wheel[REPLICA] += (effort - asked) * period / REPLICA_SLOW
+    wheel[REPLICA] += (effort - asked) * period / SLOW
     mean, wheel[REPLICA_TORQUE] = lagged_torque(
         j, wheel[REPLICA_TORQUE], asked, period, motors)
     return mean

@@ -36,6 +36,7 @@ class ControllerStatus:
         self._log = log
         self._refused = Recently()
         self._announced = None
+        self._problem = ''
         self._ticks = 0
         self._warning = ''
         self._publisher = node.create_publisher(DiagnosticStatus, 'controller_status', LATCHED)
@@ -54,13 +55,12 @@ class ControllerStatus:
                 self._warning = controller.momentum.warning(controller.speeds)
         present = (controller.mode, controller.accepted, controller.refused, self.judged,
                    controller.settings, controller.problem, controller.branch,
-                   controller.wheels.usable.tobytes(),
                    controller.wheels.verdicts.tobytes(), self._warning)
         if present == self._announced:
             return
-        if self._announced is not None and controller.problem not in ('', self._announced[5]):
+        if controller.problem not in ('', self._problem):
             self._log.warn(controller.problem)
-        self._announced = present
+        self._announced, self._problem = present, controller.problem
         goal = '' if controller.goal is None else ' '.join(
             f'{name}={angle:.6f}' for name, angle in zip(LINK_NAMES, controller.goal))
         level, summary = self._summary()

@@ -29,7 +29,6 @@ from fourbar_ros.control.allocation import (
     largest_scale,
     LOST,
     MARGIN,
-    minimum_norm,
     mobilities,
     principal_axes,
     WEAK,
@@ -191,7 +190,9 @@ def test_unknown_allocation_is_refused() -> None:
 def test_twins_of_the_rhombus_share_equally(paper: Mechanism) -> None:
     for theta in (0.4, pi / 3, pi / 2, 2.5):
         form = reduced_form(paper, assemble(paper, 0.3, 0.3 + theta), np.zeros(2))
-        torques = minimum_norm(form.wheel_map, paper.flywheel_inertias, np.array([1e-5, -3e-6]))
+        torques, _ = Problem(
+            form.wheel_map, np.array([1e-5, -3e-6]), paper.flywheel_inertias,
+            np.ones(4, dtype=bool), -NO_LIMIT, NO_LIMIT).share('min_norm')
         np.testing.assert_allclose(torques, [-5e-6, 1.5e-6, -5e-6, 1.5e-6], rtol=1e-12)
 
 

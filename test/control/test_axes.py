@@ -38,7 +38,13 @@ from fourbar_ros.control.axes import (
     TERMS,
 )
 from fourbar_ros.control.branch import Branch, CROSSED, FOLDED, LINKS_ALONE
-from fourbar_ros.mechanism import assemble, kinetic_energy, Mechanism, reduced_form
+from fourbar_ros.mechanism import (
+    assemble,
+    kinetic_energy,
+    Mechanism,
+    reduced_form,
+    ReducedForm,
+)
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -82,6 +88,16 @@ def on_branch(phi_a: float, theta: float) -> Array:
     return np.array([phi_a, phi_a + theta, phi_a, phi_a + theta])
 
 
+def check_reduced_form(axes: Axes, form: ReducedForm, seed: int) -> None:
+    # The reduced form divides by |sin theta|^2 of 0.09, and loses as much.
+    scale = np.abs(form.mass_matrix).max()
+    np.testing.assert_allclose(axes.matrix, form.mass_matrix, atol=1e-14 * scale,
+                               err_msg=f'seed {seed}')
+    np.testing.assert_allclose(axes.bias[:2], form.bias, atol=1e-12 * scale * 4.0,
+                               err_msg=f'seed {seed}')
+    np.testing.assert_allclose(axes.rows[:2], form.wheel_map, atol=1e-13, err_msg=f'seed {seed}')
+
+
 @pytest.fixture
 def mechanism(linkage: str, request: pytest.FixtureRequest) -> Mechanism:
     found: Mechanism = request.getfixturevalue(linkage)
@@ -99,13 +115,7 @@ def test_on_the_parallelogram_it_is_the_reduced_form(
     theta = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, pi - 0.3)
     angles, rates = on_branch(rng.uniform(-10.0, 10.0), theta), np.tile(rng.uniform(-2, 2, 2), 2)
     form, axes = reduced_form(mechanism, angles, rates), axes_at(mechanism, angles, rates, True)
-    # The reduced form divides by |sin theta|^2 of 0.09, and loses as much.
-    scale = np.abs(form.mass_matrix).max()
-    np.testing.assert_allclose(axes.matrix, form.mass_matrix, atol=1e-14 * scale,
-                               err_msg=f'seed {seed}')
-    np.testing.assert_allclose(axes.bias[:2], form.bias, atol=1e-12 * scale * 4.0,
-                               err_msg=f'seed {seed}')
-    np.testing.assert_allclose(axes.rows[:2], form.wheel_map, atol=1e-13, err_msg=f'seed {seed}')
+    check_reduced_form(axes, form, seed)
 
 
 @each_seed
@@ -225,19 +235,14 @@ def test_row_of_eta_on_other_branches_is_what_the_closure_leaves_free(
 def test_on_the_crossed_branch_it_is_the_reduced_form(
     seed: int, linkage: str, mechanism: Mechanism,
 ) -> None:
-    """Whose axes are links a and b, too; the tolerances are those of the parallelogram."""
+    """Whose axes are links a and b, too."""
     rng = np.random.default_rng(seed)
     theta = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, pi - 0.3)
     angles = on_other(CROSSED, rng.uniform(-3.0, 3.0), theta)
     rates = CROSSED.spread(rng.uniform(-2, 2, 2), np.zeros(2))
     form = reduced_form(mechanism, angles, rates)
     axes = axes_at(mechanism, angles, rates, True, twins=CROSSED.twins)
-    scale = np.abs(form.mass_matrix).max()
-    np.testing.assert_allclose(axes.matrix, form.mass_matrix, atol=1e-14 * scale,
-                               err_msg=f'seed {seed}')
-    np.testing.assert_allclose(axes.bias[:2], form.bias, atol=1e-12 * scale * 4.0,
-                               err_msg=f'seed {seed}')
-    np.testing.assert_allclose(axes.rows[:2], form.wheel_map, atol=1e-13, err_msg=f'seed {seed}')
+    check_reduced_form(axes, form, seed)
 
 
 @each_seed

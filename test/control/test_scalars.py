@@ -28,6 +28,7 @@ from fourbar_ros.control.scalars import (
     momentum_scalars,
 )
 from fourbar_ros.mechanism import angular_momentum, assemble, Mechanism, reduced_form
+from fourbar_ros.mechanism.dynamics import mass_matrix
 from fourbar_ros.plant import InitialState
 import numpy as np
 from numpy.typing import NDArray
@@ -111,6 +112,19 @@ def test_pairs_of_a_rhombus_keep_their_momentum(steer: Steer, prototype: Mechani
         held = max(held, 2.0 * prototype.flywheel_inertias[0] * np.abs(
             steered.plant.truth().wheel_speeds).max())
     assert held > 50.0 * 2.0 * late
+
+
+def test_axes_of_another_branch_are_its_pairs(paper: Mechanism) -> None:
+    """Folded, a turns with b and c with d: `T^T (M omega + If (omega + Omega))` of the pairs."""
+    angles, rates = np.array([0.1, 0.1, 0.9, 0.9]), np.array([0.2, 0.2, -0.3, -0.3])
+    speeds = np.array([10.0, -20.0, 30.0, 5.0])
+    controller = ticked(paper, angles, rates, speeds, change_points='choose')
+    assert controller.branch == 'folded'
+    found = momentum_of(controller)
+    momenta = (mass_matrix(angles, paper.constants) @ rates
+               + paper.flywheel_inertias * (speeds + rates))
+    np.testing.assert_allclose([found['axis_a_n_m_s'], found['axis_b_n_m_s']],
+                               [momenta[:2].sum(), momenta[2:].sum()], rtol=1e-12)
 
 
 def test_scale_and_saturated_wheels(uneven: Mechanism) -> None:
