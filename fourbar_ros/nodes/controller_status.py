@@ -53,9 +53,10 @@ class ControllerStatus:
             self._ticks += 1
             if self._ticks % LOOK_EVERY == 1:
                 self._warning = controller.momentum.warning(controller.speeds)
-        present = (controller.mode, controller.accepted, controller.refused, self.judged,
-                   controller.settings, controller.problem, controller.branch,
-                   controller.wheels.verdicts.tobytes(), self._warning)
+        # Every new goal is one more accepted.
+        present = (controller.mode, controller.goal is None, controller.accepted,
+                   controller.refused, self.judged, controller.settings, controller.problem,
+                   controller.branch, controller.wheels.verdicts.tobytes(), self._warning)
         if present == self._announced:
             return
         if controller.problem not in ('', self._problem):

@@ -226,6 +226,13 @@ def test_hold_ends_a_move_and_damp_keeps_no_place(armed, fourbar):
     armed.status('controller_status', mode='hold')
 
 
+def test_hold_after_a_move_forgets_where_it_went(armed, fourbar):
+    assert fourbar('setpoint', 'link_b=80deg') == (0, 'accepted\n', '')
+    assert armed.status('controller_status', mode='hold')['goal'] != ''
+    assert fourbar('hold') == (0, 'holds\n', '')
+    armed.status('controller_status', mode='hold', goal='')
+
+
 def test_disable_takes_the_wheels_from_the_controller_until_enable(armed, fourbar):
     assert fourbar('disable') == (0, 'not enabled: the wheels get no torque\n', '')
     armed.status('controller_status', mode='idle')
