@@ -26,6 +26,7 @@ with open(os.path.join(PACKAGE, '__init__.py'), encoding='utf-8') as stream:
     VERSION = re.search(r"^__version__ = '(.+)'$", stream.read(), re.MULTILINE).group(1)
 
 EXTRAS = {
+    'hardware': ['cantools>=39', 'python-can>=4.3'],
     'analysis': ['matplotlib>=3.7', 'rosbags>=0.10', 'tqdm'],
     'dev': [
         'colcon-core>=0.15',
@@ -80,7 +81,11 @@ setup(
         'scipy>=1.11',
     ],
     extras_require=EXTRAS,
-    entry_points={'console_scripts': [f'fourbar = {PACKAGE}.commands.main:main']},
+    entry_points={
+        'console_scripts': [f'fourbar = {PACKAGE}.commands.main:main'],
+        # What python-can calls a bus by: `interface: fourbar_udp`.
+        'can.interface': [f'fourbar_udp = {PACKAGE}.device.prototype.udp_bus:UdpBus'],
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
