@@ -27,12 +27,20 @@ from fourbar_ros.device.pacing import (
     RealtimePace,
     Remedy,
 )
-from fourbar_ros.device.protocol import Device, Drive, Samples, WheelSample
+from fourbar_ros.device.protocol import (
+    Device,
+    Drive,
+    Finding,
+    Reaction,
+    Samples,
+    WheelSample,
+)
 from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.device.testbed import Testbed, TestbedSettings, Timing
 
 __all__ = [
     'ArmingGate', 'Attendance', 'ClockLimit', 'Device', 'DeviceState', 'Drive', 'drive_by_name',
-    'FastPace', 'LockstepGuard', 'LockstepPace', 'Pace', 'PaceError', 'RealtimePace', 'Remedy',
-    'Samples', 'SimulatedTable', 'Testbed', 'TestbedSettings', 'Timing', 'WheelSample',
+    'FastPace', 'Finding', 'LockstepGuard', 'LockstepPace', 'Pace', 'PaceError', 'Reaction',
+    'RealtimePace', 'Remedy', 'Samples', 'SimulatedTable', 'Testbed', 'TestbedSettings', 'Timing',
+    'WheelSample',
 ]

@@ -16,9 +16,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Protocol
 
+from fourbar_ros.device.gate import DeviceState
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plant import SensorReading, Truth
@@ -64,12 +67,46 @@ class WheelSample:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Everything that a testbed has to say at a tick; `truth` only where it is simulated."""
+    """
+    Everything that a testbed has to say at a tick.
+
+    :param stamp_ns: the tick [ns].
+    :param links: what the sensors of the links measured since the last one.
+    :param wheels: as they are, or were when all of them were last heard.
+    :param truth: only where it is simulated.
+    :param complete: whether all wheels were heard lately enough; if not, this is no tick.
+    :param timing: of the device's own, in the order of its `timing_names`; None is not known.
+    """
 
     stamp_ns: int
     links: tuple[SensorReading, ...]
     wheels: WheelSample
     truth: Truth | None = None
+    complete: bool = True
+    timing: Sequence[float | None] = ()
+
+
+class Reaction(IntEnum):
+    """What a finding leads to, the harder the higher."""
+
+    WARN = 0
+    """People are told."""
+    COAST = 1
+    """The device is disarmed, the wheels have no power."""
+    STOP = 2
+    """As an emergency stop: likewise, until it is reset."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """
+    Something that is not as it should be.
+
+    :param text: what, where, and the limit.
+    """
+
+    reaction: Reaction
+    text: str
 
 
 class Device(Protocol):
@@ -81,6 +118,7 @@ class Device(Protocol):
     :cvar period_ns: time between two ticks [ns].
     :cvar sensor_names: the sensors of the links, `link_a` and so on.
     :cvar measures_rates: whether they have gyros.
+    :cvar timing_names: what the device itself knows of how it keeps time, with units.
     """
 
     description: str
@@ -88,6 +126,7 @@ class Device(Protocol):
     period_ns: int
     sensor_names: tuple[str, ...]
     measures_rates: bool
+    timing_names: tuple[str, ...] = ()
 
     def step(self, stamp_ns: int, drive: Drive) -> Samples:
         """
@@ -98,5 +137,36 @@ class Device(Protocol):
         :raises FourbarError: the device failed and must not be driven.
         """
 
+    def drive(self, drive: Drive) -> None:
+        """
+        Learn at once how the wheels shall be driven from now on; the next step says it again.
+
+        Nothing to do for a device that moves in its steps only.
+
+        :raises FourbarError: the device failed and must not be driven.
+        """
+        return
+
+    def gate_changed(self, state: DeviceState) -> None:
+        """Learn that the wheels may be driven now, or not any more, and why."""
+        return
+
+    def obstacles(self) -> Sequence[str]:
+        """Tell what speaks against arming now."""
+        return ()
+
+    def findings(self) -> Sequence[Finding]:
+        """Tell what was found at the last step that must have consequences."""
+        return ()
+
     def diagnosis(self) -> dict[str, str]:
         """Tell what is not as it should be, by what it is about; nothing if all is well."""
+        return {}
+
+    def facts(self) -> dict[str, object]:
+        """Tell what a person wants to know when something is wrong, counters above all."""
+        return {}
+
+    def close(self) -> None:
+        """Leave the wheels without power, and the device to others."""
+        return

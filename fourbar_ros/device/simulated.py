@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-from fourbar_ros.device.protocol import Drive, no_torque, Samples, WheelSample
+from fourbar_ros.device.protocol import Device, Drive, no_torque, Samples, WheelSample
 from fourbar_ros.mechanism import FLYWHEEL_NAMES
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plant import Fault, InitialState, Plant
@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class SimulatedTable:
+class SimulatedTable(Device):
     """
     A plant behind the device protocol.
 

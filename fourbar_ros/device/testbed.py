@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 
 from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.device.gate import ArmingGate
-from fourbar_ros.device.protocol import Device, Drive, no_torque, Samples
+from fourbar_ros.device.protocol import Device, Drive, no_torque, Reaction, Samples
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.mechanism.constants import Array
@@ -98,6 +98,8 @@ class Testbed:
         self._parked: Drive | None = None
         self._wheel_speeds = np.zeros(4)
         self._seen_ns: dict[str, int] = {}
+        self._known_state = self.gate.state
+        self._stamp_ns = 0
         self._tick_ns: int | None = None
         # Ticks without an answer so far: when each went out, by stamp. Those that have waited for
         # more than a period are counted as lost, but their round trip is still told if it ends.
@@ -121,14 +123,16 @@ class Testbed:
         try:
             samples = self.device.step(stamp_ns, self._present_drive())
         except FourbarError as error:
-            self._parked = None
-            self.gate.fail(stamp_ns, str(error))
+            self._fail(stamp_ns, error)
             raise
-        self._tick_ns = stamp_ns
-        self._wheel_speeds = samples.wheels.speeds
+        self._stamp_ns = stamp_ns
         for sample in samples.links:
             for name in sample.names:
                 self._seen_ns[name] = max(sample.stamp_ns, self._seen_ns.get(name, 0))
+        if samples.complete:
+            self._tick_ns = stamp_ns
+            self._wheel_speeds = samples.wheels.speeds
+        self._heed()
         return samples, timing
 
     def published(self, steady_ns: int, step_ns: int) -> None:
@@ -137,7 +141,7 @@ class Testbed:
 
         :param step_ns: time that the device needed for it [ns].
         """
-        if self._tick_ns is not None:
+        if self._tick_ns is not None and self._tick_ns == self._stamp_ns:
             self._open_ticks[self._tick_ns] = steady_ns
         self._step_ns = step_ns
 
@@ -171,6 +175,8 @@ class Testbed:
         self._command_steady_ns = steady_ns
         self._answered(stamp_ns, steady_ns)
         self._drive = replace(drive, values=limited)
+        if self.gate.armed:
+            self._tell_device()
 
     def arm(self, steady_ns: int, obstacles: Sequence[str]) -> tuple[bool, str]:
         """
@@ -185,27 +191,38 @@ class Testbed:
         if silent:
             obstacles = [*obstacles, f'no sample from {", ".join(silent)} for '
                                      f'{self._settings.sensor_timeout_s:g} s']
+        obstacles = [*obstacles, *self.device.obstacles()]
         was_armed = self.gate.armed
         armed, message = self.gate.arm(self._now_ns, obstacles)
         if armed and not was_armed:
             self._armed_steady_ns = steady_ns
             self._parked = None
             self._drive = no_torque()
+            self._gate_changed()
         return armed, message
 
     def disarm(self, reason: str) -> None:
         """Stop driving: the wheels coast, without power."""
         self._parked = None
         self.gate.disarm(self._now_ns, reason)
+        self._gate_changed()
 
     def emergency_stop(self, reason: str) -> None:
         """Stop driving until reset: the wheels coast, without power."""
         self._parked = None
         self.gate.emergency_stop(self._now_ns, reason)
+        self._gate_changed()
 
     def reset(self) -> tuple[bool, str]:
         """Release emergency stop or fault; the wheels stay disarmed."""
-        return self.gate.reset(self._now_ns)
+        answer = self.gate.reset(self._now_ns)
+        self._gate_changed()
+        return answer
+
+    def close(self) -> None:
+        """Leave the wheels without power, and the device to others."""
+        self.disarm('the node ends')
+        self.device.close()
 
     def diagnosis(self) -> dict[str, object]:
         """Tell what a person wants to know when something is wrong."""
@@ -215,12 +232,39 @@ class Testbed:
             'last_rejection': self.last_rejection,
             **{f'commands_rejected_{kind}': count
                for kind, count in sorted(self.rejected.items())},
-            **self.device.diagnosis()}
+            **self.device.diagnosis(), **self.device.facts()}
 
     @property
     def _now_ns(self) -> int:
-        """Return the stamp of the last tick, 0 before the first [ns]."""
-        return 0 if self._tick_ns is None else self._tick_ns
+        """Return the stamp of the last step of the device, 0 before the first [ns]."""
+        return self._stamp_ns
+
+    def _gate_changed(self) -> None:
+        """Let the device know at once, if it does not yet."""
+        if self.gate.state is self._known_state:
+            return
+        self._known_state = self.gate.state
+        self.device.gate_changed(self.gate.state)
+        self._tell_device()
+
+    def _tell_device(self) -> None:
+        try:
+            self.device.drive(self._present_drive())
+        except FourbarError as error:
+            self._fail(self._now_ns, error)
+
+    def _fail(self, stamp_ns: int, error: FourbarError) -> None:
+        self._parked = None
+        self.gate.fail(stamp_ns, str(error))
+        self._known_state = self.gate.state
+
+    def _heed(self) -> None:
+        """Do what the findings of the device lead to."""
+        for finding in self.device.findings():
+            if finding.reaction is Reaction.STOP:
+                self.emergency_stop(finding.text)
+            elif finding.reaction is Reaction.COAST:
+                self.disarm(finding.text)
 
     def _check_stamp(self, stamp_ns: int) -> None:
         if self._tick_ns is None:
@@ -268,6 +312,7 @@ class Testbed:
                 self._parked = _at_speeds(self._wheel_speeds)
             elif self._settings.timeout_action == 'brake':
                 self._parked = _at_speeds(np.zeros(4))
+            self._gate_changed()
 
     def _present_drive(self) -> Drive:
         if self.gate.armed:

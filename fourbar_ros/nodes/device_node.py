@@ -87,7 +87,7 @@ class DeviceNode(Node):
 
     def close(self):
         """Leave the wheels without torque, and say so."""
-        self._testbed.disarm('the node ends')
+        self._testbed.close()
         self._announce()
 
     def now_ns(self):

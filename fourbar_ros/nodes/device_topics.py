@@ -68,12 +68,15 @@ class DeviceTopics:
         for sample in samples.links if links else ():
             self._links.publish(sample.stamp_ns, sample.angles, sample.rates, names=sample.names)
         wheels = samples.wheels
-        self._wheels.publish(samples.stamp_ns, wheels.angles, wheels.speeds, wheels.efforts)
+        if samples.complete:
+            self._wheels.publish(
+                samples.stamp_ns, wheels.angles, wheels.speeds, wheels.efforts)
 
     def publish_timing(self, stamp_ns, timing):
-        """Publish what is known of how the loop keeps time."""
+        """Publish what is known of how the loop keeps time, and the device."""
         scalars = {name: getattr(timing, name) for name in TIMING_NAMES}
-        known = tuple(name for name in TIMING_NAMES if scalars[name] is not None)
+        scalars.update(zip(self._device.timing_names, self._samples.timing))
+        known = tuple(name for name, value in scalars.items() if value is not None)
         self._timing.publish(stamp_ns, [scalars[name] for name in known], names=known)
 
     def announce(self):

@@ -16,11 +16,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from fourbar_ros.device import (
     ArmingGate,
+    Device,
+    DeviceState,
     Drive,
+    Finding,
     Samples,
     Testbed,
     TestbedSettings,
@@ -38,7 +41,7 @@ Array = NDArray[np.float64]
 PERIOD_NS = 4_000_000
 
 
-class Bench:
+class Bench(Device):
     """
     A device that does what it is told.
 
@@ -49,6 +52,10 @@ class Bench:
     :ivar gate_then: that state and reason.
     :ivar links: the links that give a sample.
     :ivar breaks: whether the next step fails.
+    :ivar complete: whether it hears its wheels.
+    :ivar told, gates: what it was told between steps, of drives and of the gate.
+    :ivar found, in_the_way: its findings, and what speaks against arming.
+    :ivar closed: whether it was.
     """
 
     description = 'bench'
@@ -62,13 +69,37 @@ class Bench:
         self.powered: list[list[bool]] = []
         self.links: tuple[int, ...] = (0, 1, 2, 3)
         self.breaks = False
+        self.complete = True
+        self.told: list[Drive] = []
+        self.gates: list[DeviceState] = []
+        self.found: list[Finding] = []
+        self.in_the_way: list[str] = []
+        self.closed = False
         self.gate = ArmingGate()
         self.gate_then = (self.gate.state, '')
         self.speeds = np.array([10.0, -20.0, 0.0, 5.0])
 
-    def diagnosis(self) -> dict[str, str]:
-        """Nothing is ever wrong with a bench."""
-        return {}
+    def drive(self, drive: Drive) -> None:
+        """Take down what it is told between steps."""
+        if self.breaks:
+            raise FourbarError('the bus is off')
+        self.told.append(drive)
+
+    def gate_changed(self, state: DeviceState) -> None:
+        """Take down what the gate does."""
+        self.gates.append(state)
+
+    def findings(self) -> Sequence[Finding]:
+        """Find what it was made to."""
+        return self.found
+
+    def obstacles(self) -> Sequence[str]:
+        """Be in the way if it was made to."""
+        return self.in_the_way
+
+    def close(self) -> None:
+        """Take down that it was closed."""
+        self.closed = True
 
     def step(self, stamp_ns: int, drive: Drive) -> Samples:
         """Take down the torques and let the wheels follow them."""
@@ -84,7 +115,8 @@ class Bench:
         self.speeds = self.speeds + torques / self.mechanism.flywheel_inertias * 4e-3
         names = tuple(LINK_NAMES[link] for link in self.links)
         sample = SensorReading(stamp_ns, names, np.zeros(len(names)), np.empty(0))
-        return Samples(stamp_ns, (sample,), WheelSample(np.zeros(4), self.speeds, torques))
+        return Samples(stamp_ns, (sample,), WheelSample(np.zeros(4), self.speeds, torques),
+                       complete=self.complete)
 
 
 class Operated:

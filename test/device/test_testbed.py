@@ -23,6 +23,8 @@ from typing import Any
 from fourbar_ros.device import (
     DeviceState,
     Drive,
+    Finding,
+    Reaction,
     SimulatedTable,
     Testbed,
     TestbedSettings,
@@ -235,6 +237,96 @@ def test_failing_device_latches_a_fault(operate: Operate) -> None:
     assert bed.arm()[0]
     bed.tick()
     assert bed.driven == NONE
+
+
+# What the device learns between steps, and what it finds
+
+def test_device_learns_of_commands_at_once_and_only_while_armed(operate: Operate) -> None:
+    bed = operate(armed=False)
+    bed.tick()
+    bed.command(1e-5)
+    assert bed.bench.told == []
+    bed.arm()
+    bed.bench.told.clear()
+    bed.command(2e-5)
+    drive, = bed.bench.told
+    assert (drive.values[0], drive.powered.tolist()) == (2e-5, [True, False, False, False])
+
+
+@pytest.mark.parametrize('way', ['disarm', 'emergency_stop', 'watchdog', 'close'])
+def test_device_learns_at_once_that_it_has_no_power(way: str, operate: Operate) -> None:
+    bed = operate()
+    bed.command(1e-5)
+    bed.bench.told.clear()
+    if way == 'watchdog':
+        bed.tick(periods=26)
+    elif way == 'close':
+        bed.testbed.close()
+    else:
+        getattr(bed.testbed, way)('test')
+    assert [drive.powered.any() for drive in bed.bench.told] == [False]
+    assert bed.bench.gates[-1] is bed.testbed.gate.state is not DeviceState.ARMED
+    assert bed.bench.closed == (way == 'close')
+
+
+def test_device_is_told_every_change_of_the_gate_once(operate: Operate) -> None:
+    bed = operate()
+    bed.testbed.emergency_stop('test')
+    bed.testbed.emergency_stop('again')
+    bed.testbed.reset()
+    bed.testbed.disarm('test')
+    bed.arm()
+    assert bed.bench.gates == [DeviceState.ARMED, DeviceState.EMERGENCY_STOP,
+                               DeviceState.DISARMED, DeviceState.ARMED]
+
+
+def test_device_that_fails_to_take_a_command_latches_a_fault(operate: Operate) -> None:
+    bed = operate()
+    bed.bench.breaks = True
+    bed.command(1e-5)
+    assert (bed.testbed.gate.state, bed.testbed.gate.reason) == (
+        DeviceState.FAULT, 'the bus is off')
+
+
+@pytest.mark.parametrize(('reaction', 'state'), [
+    (Reaction.WARN, DeviceState.ARMED), (Reaction.COAST, DeviceState.DISARMED),
+    (Reaction.STOP, DeviceState.EMERGENCY_STOP)])
+def test_finding_has_its_consequence(
+    reaction: Reaction, state: DeviceState, operate: Operate,
+) -> None:
+    bed = operate()
+    bed.command(1e-5)
+    bed.bench.found = [Finding(reaction, 'link_b is hot')]
+    bed.tick()
+    assert bed.testbed.gate.state is state
+    assert (bed.testbed.gate.reason == 'link_b is hot') == (state is not DeviceState.ARMED)
+    bed.bench.found = []
+    bed.tick()
+    assert bed.powered == (
+        [True, False, False, False] if state is DeviceState.ARMED else OFF)
+
+
+def test_what_the_device_knows_to_be_in_the_way_keeps_it_from_being_armed(
+    operate: Operate,
+) -> None:
+    bed = operate(armed=False)
+    bed.tick()
+    bed.bench.in_the_way = ['link_c was never heard']
+    assert bed.arm() == (False, 'refused: link_c was never heard')
+
+
+def test_step_without_all_wheels_is_no_tick_that_anybody_could_answer(operate: Operate) -> None:
+    bed = operate()
+    bed.command(1e-5)
+    answered_ns = bed.stamp_ns
+    bed.bench.complete = False
+    bed.tick()
+    with pytest.raises(RejectedError, match='ahead'):
+        bed.command(1e-5)
+    _, timing = bed.tick(periods=3.0)
+    assert timing.lost == 0
+    bed.testbed.command(
+        answered_ns, ['flywheel_a'], [], [], [2e-5], bed.steady_ns)
 
 
 # Watchdog
