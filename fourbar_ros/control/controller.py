@@ -140,6 +140,7 @@ class Controller:
         self._period = 0.0
         self._checked_period = 0.0
         self._lost = 0
+        self._late = False
         self._gain_problem = ''
         self._bearings = _bearings_of(settings)
         self.law.tune(settings, ALL)
@@ -258,7 +259,7 @@ class Controller:
         self._accept(way, goal)
 
     def tick(self, stamp_ns: int, link_angles: Array, link_rates: Array, disturbance: Array,
-             wheel_speeds: Array, efforts: Array) -> Control:
+             wheel_speeds: Array, efforts: Array, *, late: bool = False) -> Control:
         """
         Decide on the commands for one tick.
 
@@ -268,6 +269,7 @@ class Controller:
             [N m].
         :param wheel_speeds: (4,) measured, relative to the links [rad/s].
         :param efforts: (4,) torques really applied since the last tick [N m].
+        :param late: whether the tick comes so late that nobody knows when the answer will act.
         """
         if self._last is not None and self._last.stamp_ns == stamp_ns:
             # A lock-step sends a tick again when its answer was lost.
@@ -279,7 +281,10 @@ class Controller:
         guide, driving = self._guide, self.mode not in ('disarmed', 'idle')
         friction = self._drive.look(wheel_speeds, self.settings)
         if driving and was not in ('disarmed', 'idle'):
-            self._watch(period, link_rates, wheel_speeds, efforts)
+            # The first period of which the command is known begins at the second tick in time.
+            known = not (late or self._late) and self._is_single(period)
+            self._watch(period, known, link_rates, wheel_speeds, efforts)
+        self._late = late
         if guide.follow(stamp_ns) and self.mode == 'track':
             self.mode = 'hold'
         if not driving or self.mode == 'damp':
@@ -365,11 +370,17 @@ class Controller:
         self.wheels.begin()
         self.law.tune(self.settings, self.wheels.usable)
 
-    def _watch(self, period: float, link_rates: Array, speeds: Array, efforts: Array) -> None:
+    def _is_single(self, period: float) -> bool:
+        """Tell whether no tick was missed since the last one."""
+        return 0.0 < period < 1.5 * self._checked_period
+
+    def _watch(self, period: float, known: bool, link_rates: Array, speeds: Array,
+               efforts: Array) -> None:
         """Look at the wheels; take out of the allocation which cannot be used any more."""
-        if period <= 0.0:
-            return
         command = self._command
+        if not known:
+            self.wheels.lose(command.values, command.by_speed, speeds, link_rates, efforts)
+            return
         if not self.wheels.look(
                 period, command.values, command.by_speed, command.powered, speeds, link_rates,
                 efforts, self._bearings):
@@ -492,6 +503,7 @@ class Controller:
         for by_speed in (False, True):
             for _ in range(2):
                 self.wheels.look(1e-3, none, by_speed, ALL, none, none, none, none[:2])
+            self.wheels.lose(none, by_speed, none, none, none)
             self._drive.command(none, none, none, ALL, 1e-3, by_speed)
         self.wheels.begin()
         self.momentum.look(1e-3, none, none, none)

@@ -159,6 +159,19 @@ class WheelWatch:
             self.usable = self.verdicts < DEAD
         return bool(changed)
 
+    def lose(self, commands: Array, by_speed: bool, speeds: Array, link_rates: Array,
+             efforts: Array) -> None:
+        """
+        Begin again from the wheels as they are, thinking of them as before.
+
+        For a period of which it is not known what the wheels were told, or that was not seen.
+
+        :param commands, by_speed: now in force.
+        :param speeds, link_rates, efforts: as of :meth:`look`.
+        """
+        if self._started:
+            _lose(commands, by_speed, speeds, link_rates, efforts, self._motors, self._kept)
+
     def findings(self) -> dict[str, str]:
         """Return what is the matter, by the name of the wheel; nothing if all are healthy."""
         return {name: VERDICTS[verdict] for name, verdict in zip(
@@ -172,6 +185,24 @@ def _begin(kept: Array, past: Array, late: Array, speeds: Array, rates: Array) -
         kept[j, MODEL_SPEED] = kept[j, LAST_SPEED] = speeds[j]
         kept[j, LAST_RATE], kept[j, SETTLED] = rates[j], AFTER_STRAIN
         kept[j, INTEGRAL] = kept[j, REPLICA] = nan
+
+
+@kernel
+def _lose(commands: Array, by_speed: bool, speeds: Array, rates: Array, efforts: Array,
+          boxed: NDArray[np.record], kept: Array) -> None:
+    motors = boxed[0]
+    for j in range(4):
+        wheel, effort = kept[j], efforts[j]
+        wheel[MODEL_SPEED] = wheel[LAST_SPEED] = speeds[j]
+        wheel[LAST_RATE] = rates[j]
+        wheel[MODEL_TORQUE] = wheel[EXPECTED] = wheel[EFFORT] = wheel[GAIN] = effort
+        wheel[AGAINST] = wheel[SETTLED] = 0.0
+        wheel[INTEGRAL] = wheel[REPLICA] = nan
+        if by_speed:
+            # What the motor's own loop has learnt is what it gives beyond the error.
+            limit = motors.torque_limit[j]
+            learnt = effort - SPEED_BANDWIDTH * motors.inertia[j] * (commands[j] - speeds[j])
+            wheel[INTEGRAL] = min(max(learnt, -limit), limit)
 
 
 @kernel

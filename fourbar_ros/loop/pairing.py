@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Inputs that belong to the same tick, brought together by their stamp."""
+"""Inputs that belong to the same tick, brought together by their stamp, in time or late."""
 
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ from typing import Any
 
 # Ticks that may be incomplete at the same time.
 DEPTH = 16
+
+# Two clocks may drift apart so fast [s/s].
+DRIFT = 1e-4
 
 
 class StampPairs:
@@ -45,3 +48,33 @@ class StampPairs:
             # The oldest by arrival: a device that starts again may be behind in time.
             del self._halves[next(iter(self._halves))]
         return None
+
+
+class Punctuality:
+    """
+    Tells ticks that come late from those in time, by any clock that goes on steadily.
+
+    Stamps may be of another clock: what counts is how much later than the earliest one comes.
+    """
+
+    def __init__(self) -> None:
+        self._earliest_ns: float | None = None
+        self._stamp_ns = 0
+        self._period_ns = 0
+
+    def is_late(self, stamp_ns: int, steady_ns: int) -> bool:
+        """
+        Tell whether a tick comes so late that the next one is due as well.
+
+        :param stamp_ns: of the tick [ns].
+        :param steady_ns: now [ns].
+        """
+        since_ns = stamp_ns - self._stamp_ns
+        self._stamp_ns = stamp_ns
+        behind_ns = steady_ns - stamp_ns
+        if self._earliest_ns is None or since_ns <= 0:
+            self._earliest_ns, self._period_ns = behind_ns, 0
+            return False
+        self._period_ns = min(since_ns, self._period_ns or since_ns)
+        self._earliest_ns = min(behind_ns, self._earliest_ns + DRIFT * since_ns)
+        return behind_ns - self._earliest_ns > self._period_ns

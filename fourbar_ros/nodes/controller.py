@@ -25,7 +25,7 @@ from fourbar_ros.control.scalars import (
     MOMENTUM,
     momentum_scalars,
 )
-from fourbar_ros.loop.pairing import StampPairs
+from fourbar_ros.loop.pairing import Punctuality, StampPairs
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism
 from fourbar_ros.nodes.controller_services import ControllerServices
 from fourbar_ros.nodes.controller_status import ControllerStatus
@@ -36,6 +36,7 @@ from fourbar_ros.nodes.messages import (
     RELIABLE,
     sensor_quality,
     stamp_of,
+    steady_ns,
     TABLE_FRAME,
 )
 from fourbar_ros.nodes.parameters import declare
@@ -61,6 +62,9 @@ class ControllerNode(Node):
         mechanism = load_mechanism(values['mechanism'])
         self._controller = Controller(mechanism, _settings(values))
         self._pairs = StampPairs()
+        # Simulated time waits for whoever is late, or is of no fixed pace.
+        simulated = self.get_parameter('use_sim_time').value
+        self._punctuality = None if simulated else Punctuality()
         self._log = RareLog(self)
         self._last_stamp_ns = None
         self._ticks = 0
@@ -115,7 +119,8 @@ class ControllerNode(Node):
         pair = self._pairs.complete(stamp_ns, kind, value)
         if pair is None:
             return
-        control = self._controller.tick(stamp_ns, *pair['links'], *pair['wheels'])
+        late = self._punctuality is not None and self._punctuality.is_late(stamp_ns, steady_ns())
+        control = self._controller.tick(stamp_ns, *pair['links'], *pair['wheels'], late=late)
         names, velocities, efforts = by_name(control.command)
         if control.command.by_speed:
             self._command.publish(stamp_ns, velocities, names=names, fields=('velocity',))

@@ -14,7 +14,7 @@
 
 """Two halves of a tick find each other, whatever the order and whatever was lost."""
 
-from fourbar_ros.loop.pairing import DEPTH, StampPairs
+from fourbar_ros.loop.pairing import DEPTH, Punctuality, StampPairs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
@@ -97,3 +97,31 @@ def test_device_that_starts_again_at_an_earlier_time_is_paired_again(lost: int) 
     assert any(complete)
     assert all(complete[complete.index(True):])
     assert complete.index(True) <= DEPTH
+
+
+
+
+def lateness(delays_ms: list[float], drift: float = 0.0) -> list[bool]:
+    """Let ticks come so late, by a clock that drifts and began at another time."""
+    punctuality = Punctuality()
+    return [punctuality.is_late(
+        n * PERIOD, 10 ** 15 + round((n * PERIOD + delay * 1e6) * (1.0 + drift)))
+        for n, delay in enumerate(delays_ms)]
+
+
+def test_tick_is_late_when_the_next_one_is_due() -> None:
+    # Held up for 22 ms: of the ticks that waited only the last ones are in time.
+    assert lateness([1.0, 0.5, 0.7, 22.0, 18.0, 14.0, 10.0, 6.0, 2.0, 0.6]) == (
+        [False] * 3 + [True] * 5 + [False] * 2)
+
+
+@pytest.mark.parametrize('drift', [-5e-5, 5e-5])
+def test_clocks_that_drift_apart_make_no_tick_late(drift: float) -> None:
+    assert not any(lateness([0.5] * 50_000, drift))
+
+
+def test_clock_that_starts_anew_begins_with_a_tick_in_time() -> None:
+    punctuality = Punctuality()
+    assert not punctuality.is_late(10 ** 10, 0)
+    assert not punctuality.is_late(10 ** 9, 10 ** 12)
+    assert not punctuality.is_late(10 ** 9 + PERIOD, 10 ** 12 + PERIOD)
