@@ -99,8 +99,6 @@ def test_device_that_starts_again_at_an_earlier_time_is_paired_again(lost: int) 
     assert complete.index(True) <= DEPTH
 
 
-
-
 def lateness(delays_ms: list[float], drift: float = 0.0) -> list[bool]:
     """Let ticks come so late, by a clock that drifts and began at another time."""
     punctuality = Punctuality()
