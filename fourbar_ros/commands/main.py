@@ -36,6 +36,8 @@ from fourbar_ros.errors import FourbarError
 
 NODES = {
     'plant': 'simulated air table with the linkage on it',
+    'hardware': 'the prototype, over a bus to its links',
+    'prototype_emulator': 'the links of the prototype, emulated on the bus',
     'estimator': 'Kalman filter on link angles and wheel motion',
     'controller': 'tracking law and wheel allocation',
 }

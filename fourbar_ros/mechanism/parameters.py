@@ -49,7 +49,7 @@ ROUNDING = 1e-15
 
 # Least values of those that need not be positive.
 LOWEST = {'com_positions': -np.inf, 'joint_damping': 0.0, 'motor_time_constants': 0.0,
-          'motor_resistances': 0.0}
+          'motor_resistances': 0.0, 'link_angle_offsets': -np.inf}
 
 
 class MechanismError(FourbarError):
@@ -82,6 +82,8 @@ class Mechanism:
     :param joint_stiffness: (4,) how hard the two ends in joints 1 to 4 are pulled together [N/m],
         default infinite: rigid. Either all four joints are rigid or none.
     :param joint_damping: (4,) of the same, for joints that are not rigid [N s/m], default 0.
+    :param link_angle_offsets: (4,) that the sensors of the links read beyond the true angle [rad],
+        default 0.
     :raises MechanismError: wrong shape, not finite, not positive, lengths that cannot close, or
         joints of which only some are rigid.
     """
@@ -99,6 +101,7 @@ class Mechanism:
     motor_voltages: Array = field(default_factory=lambda: np.full(4, np.inf))
     joint_stiffness: Array = field(default_factory=lambda: np.full(4, np.inf))
     joint_damping: Array = field(default_factory=lambda: np.zeros(4))
+    link_angle_offsets: Array = field(default_factory=lambda: np.zeros(4))
 
     def __post_init__(self) -> None:
         """Check every value and make every array read-only."""
@@ -179,6 +182,7 @@ class Mechanism:
         """
         names = {item.name for item in fields(cls)}
         optional = {name for name in names if name.startswith(('motor_', 'joint_'))}
+        optional.add('link_angle_offsets')
         check_keys(values, names - optional, origin, MechanismError, optional=optional)
         try:
             return cls(**values)

@@ -37,24 +37,33 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-PARAMETERS = (
-    Parameter('mechanism', 'paper', '', 'preset or path of a mechanism file'),
-    Parameter('rate', 250.0, 'Hz', 'control rate, one tick per period', limits=(1.0, 2000.0)),
-    Parameter('command_timeout', 0.1, 's', 'longest time without a command while armed',
-              limits=(0.002, 10.0)),
-    Parameter('sensor_timeout', 0.2, 's', 'a link without a sample for so long is silent',
-              limits=(0.002, 10.0)),
-    Parameter('timeout_action', 'coast', '', 'what the wheels do when commands stay away',
-              choices=TIMEOUT_ACTIONS),
-)
+
+def common_parameters(mechanism):
+    """
+    List the parameters that all devices have.
+
+    :param mechanism: default of that parameter.
+    """
+    return (
+        Parameter('mechanism', mechanism, '', 'preset or path of a mechanism file'),
+        Parameter('rate', 250.0, 'Hz', 'control rate, one tick per period',
+                  limits=(1.0, 2000.0)),
+        Parameter('command_timeout', 0.1, 's', 'longest time without a command while armed',
+                  limits=(0.002, 10.0)),
+        Parameter('sensor_timeout', 0.2, 's', 'a link without a sample for so long is silent',
+                  limits=(0.002, 10.0)),
+        Parameter('timeout_action', 'coast', '', 'what the wheels do when commands stay away',
+                  choices=TIMEOUT_ACTIONS),
+    )
 
 
 class DeviceNode(Node):
     """
     Drive a device tick by tick and let its commands through the arming gate.
 
-    :param parameters: the node's own table, added to the common one.
-    :param make_device: called with the values of all parameters and the period [ns].
+    :param parameters: the node's table, the common ones among them.
+    :param make_device: called with the values of all parameters, the period [ns], and what turns
+        the time of the steady clock into that of stamps [ns], once there are ticks.
     :param make_pace: called with the same, returns the pace and how often to look at it [ns].
     """
 
@@ -62,10 +71,12 @@ class DeviceNode(Node):
         super().__init__(name)
         guard = runtime.guard
         # Changed in place when somebody sets a parameter.
-        self._values = values = declare(self, PARAMETERS + parameters, self.parameters_changed)
+        self._values = values = declare(self, parameters, self.parameters_changed)
         period_ns = round(1e9 / values['rate'])
-        self._testbed = Testbed(make_device(values, period_ns), TestbedSettings(
-            values['command_timeout'], values['sensor_timeout'], values['timeout_action']))
+        self._testbed = Testbed(
+            make_device(values, period_ns, lambda time_ns: self._pace.now_ns(time_ns)),
+            TestbedSettings(values['command_timeout'], values['sensor_timeout'],
+                            values['timeout_action']))
         device = self._testbed.device
         self._log, self._rejected = RareLog(self), Recently()
         self._topics = DeviceTopics(self, self._testbed, values['mechanism'])
@@ -145,6 +156,8 @@ class DeviceNode(Node):
         # Whoever answers the tick should know by then what state the device is in.
         self._announce()
         self._topics.publish_samples(samples)
+        if not samples.complete:
+            return
         self._testbed.published(self.now_ns(), step_ns)
         self._topics.publish_timing(stamp_ns, timing)
         self.ticked(stamp_ns, samples.truth)

@@ -33,15 +33,19 @@ LEDGER_RATE = 10.0
 
 
 class GroundTruth:
-    """Publish the state without its sensors, and the accounts of energy and momentum."""
+    """
+    Publish the state without its sensors, and the accounts of energy and momentum.
 
-    def __init__(self, node, device):
+    :param period_ns: how often it will be asked to [ns].
+    """
+
+    def __init__(self, node, device, period_ns):
         self._device = device
         self._links = JointStatePublisher(node, 'sim/link_states', LINK_NAMES, frame=TABLE_FRAME)
         self._wheels = JointStatePublisher(
             node, 'sim/flywheel_states', FLYWHEEL_NAMES, ('position', 'velocity', 'effort'))
         self._ledger = JointStatePublisher(node, 'sim/ledger', LEDGER_NAMES, ('position',))
-        self._ticks_per_ledger = max(1, round(1e9 / device.period_ns / LEDGER_RATE))
+        self._ticks_per_ledger = max(1, round(1e9 / period_ns / LEDGER_RATE))
         self._ticks = 0
         self._odometry = node.create_publisher(Odometry, 'sim/odometry', RELIABLE)
         self._message = Odometry()

@@ -14,11 +14,7 @@
 
 """The simulated air table as a node."""
 
-from math import pi
-
-from fourbar_ros.device import Remedy, SimulatedTable
-from fourbar_ros.mechanism import FLYWHEEL_NAMES, load_mechanism, SENSOR_NAMES
-from fourbar_ros.mechanism.closure import BRANCHES
+from fourbar_ros.device import Remedy
 from fourbar_ros.nodes import device_node
 from fourbar_ros.nodes.ground_truth import GroundTruth
 from fourbar_ros.nodes.messages import steady_ns
@@ -26,49 +22,29 @@ from fourbar_ros.nodes.paces import fast_pace, lockstep_pace, realtime_pace
 from fourbar_ros.nodes.parameters import Parameter
 from fourbar_ros.nodes.runtime import run_node
 from fourbar_ros.nodes.sim_services import SimServices
-from fourbar_ros.nodes.simulated_time import (
-    Lockstep,
-    SimulatedClock,
+from fourbar_ros.nodes.simulated_time import Lockstep, SimulatedClock
+from fourbar_ros.nodes.table_parameters import (
+    apply_faults,
+    initial_state,
+    make_table,
+    table_parameters,
 )
-from fourbar_ros.plant import InitialState, load_table, Plant
-from fourbar_ros.plant.schedule import read_schedule
-import numpy as np
 
 # Clocks, each with a function of all parameters and the period [ns] that makes its pace.
 CLOCKS = {'realtime': realtime_pace, 'fast': fast_pace, 'lockstep': lockstep_pace}
 
-OWN_PARAMETERS = (
-    Parameter('table', 'ideal', '', 'preset or path of a table file'),
+_TABLE = table_parameters('ideal')
+PARAMETERS = (
+    *device_node.common_parameters('paper'),
+    _TABLE[0],
     Parameter('clock', 'realtime', '', 'what the ticks follow', choices=tuple(CLOCKS)),
     Parameter('real_time_factor', 1.0, '', 'simulated seconds per second of the fast clock, 0 '
               'for as fast as it can', limits=(0.0, 1000.0)),
     Parameter('guard_timeout', 1.0, 's', 'lock-step tells for whom it waits after so long',
               limits=(0.05, 3600.0)),
     Parameter('start_paused', False, '', 'wait for sim/step or sim/pause before the first tick'),
-    Parameter('step', 0.0005, 's', 'integration step; the period is a whole multiple of it',
-              limits=(1e-6, 0.1)),
-    Parameter('seed', 0, '', 'of all random numbers', limits=(0, 2 ** 63 - 1)),
-    Parameter('fault_schedule', '', '', 'path of a YAML file of faults that come and go',
-              live=True),
-    *(Parameter(f'fault.{name}', '', '', 'what is wrong with it, as `off` or `wrong 0.1`',
-                live=True) for name in SENSOR_NAMES),
-    *(Parameter(f'fault.{name}', '', '', 'what is wrong with it, as `dead` or `weak 0.5`',
-                live=True) for name in FLYWHEEL_NAMES),
-    Parameter('initial.link_a', 0.0, 'rad', 'orientation of link a at start and reset',
-              limits=(-1e6, 1e6), live=True),
-    Parameter('initial.link_b', round(pi / 3, 12), 'rad',
-              'orientation of link b at start and reset', limits=(-1e6, 1e6), live=True),
-    Parameter('initial.branch', 'open', '', 'assembly at start and reset', choices=BRANCHES,
-              live=True),
-    Parameter('initial.rate_a', 0.0, 'rad/s', 'rate of link a at start and reset',
-              limits=(-100.0, 100.0), live=True),
-    Parameter('initial.rate_b', 0.0, 'rad/s', 'rate of link b at start and reset',
-              limits=(-100.0, 100.0), live=True),
+    *_TABLE[1:],
 )
-PARAMETERS = device_node.PARAMETERS + OWN_PARAMETERS
-
-
-FAULTS = tuple(row.name for row in PARAMETERS if row.name.startswith('fault'))
 
 
 class PlantNode(device_node.DeviceNode):
@@ -78,8 +54,9 @@ class PlantNode(device_node.DeviceNode):
     _lockstep = _simulated_clock = None
 
     def __init__(self, runtime):
-        super().__init__(runtime, 'plant', OWN_PARAMETERS, make_device, make_pace)
-        self._ground_truth = GroundTruth(self, self._testbed.device)
+        super().__init__(runtime, 'plant', PARAMETERS, make_device, make_pace)
+        self._ground_truth = GroundTruth(
+            self, self._testbed.device, self._testbed.device.period_ns)
         guard, values = runtime.guard, self._values
         if values['clock'] == 'lockstep':
             self._lockstep = Lockstep(
@@ -126,40 +103,9 @@ class PlantNode(device_node.DeviceNode):
         self._announce()
 
 
-def initial_state(values):
-    """Return the state that the parameters describe."""
-    return InitialState(**{name.split('.')[1]: value for name, value in values.items()
-                           if name.startswith('initial.')})
-
-
-def make_device(values, period_ns):
+def make_device(values, period_ns, _stamp_of):
     """Make the simulated table that the parameters describe."""
-    plant = Plant(
-        load_mechanism(values['mechanism']), load_table(values['table']), initial_state(values),
-        values['step'], np.random.default_rng(values['seed']))
-    table = SimulatedTable(plant, period_ns)
-    apply_faults(table, dict.fromkeys(FAULTS, ''), values)
-    return table
-
-
-def apply_faults(table, before, now):
-    """
-    Break, mend and schedule what parameters say that are not what they were.
-
-    :raises FaultError, ConfigurationError: a fault that cannot be, or of what is not there, or a
-        file that is refused; then nothing was changed.
-    """
-    changed = [name for name in FAULTS if now[name] != before[name]]
-    faults = {}
-    for name in changed:
-        target = name.partition('.')[2]
-        if target:
-            faults[target] = table.faults.parse(target, now[name])
-    if 'fault_schedule' in changed:
-        path = now['fault_schedule']
-        table.schedule_faults(read_schedule(path) if path else [], path)
-    for target, fault in faults.items():
-        table.break_down(target, fault)
+    return make_table(values, period_ns)
 
 
 def make_pace(values, period_ns):

@@ -76,8 +76,12 @@ class Runtime:
                 return args[1] if len(args) > 1 else None
         return guarded
 
-    def spin(self):
-        """Run callbacks until a signal or a failure; raises the failure."""
+    def spin(self, work=None):
+        """
+        Run callbacks until a signal or a failure; raises the failure.
+
+        :param work: called again and again instead, by a node that lets ROS have its turn itself.
+        """
         # What lives until the end need not be searched for garbage: with all that numba and
         # matplotlib leave behind, one full search takes longer than several ticks.
         gc.collect()
@@ -85,7 +89,10 @@ class Runtime:
         if self._real_time:
             go_first()
         while not self.stopping and self.failure is None:
-            self.executor.spin_once(timeout_sec=SPIN_TIMEOUT)
+            if work is None:
+                self.executor.spin_once(timeout_sec=SPIN_TIMEOUT)
+            else:
+                work()
         if self.failure is not None:
             raise self.failure
 
@@ -106,7 +113,8 @@ def run_node(make_node, name, description, argv):
     """
     Run one node until a signal.
 
-    :param make_node: called with the runtime, returns a node with a `close()`.
+    :param make_node: called with the runtime, returns a node with a `close()`, and with a `work()`
+        where it does not live on callbacks.
     :param argv: what follows the executable's name.
     :returns: exit code.
     :raises RosError: bad arguments or no usable ROS.
@@ -129,7 +137,7 @@ def run_node(make_node, name, description, argv):
         with announced():
             node = make_node(runtime)
         runtime.executor.add_node(node)
-        runtime.spin()
+        runtime.spin(getattr(node, 'work', None))
     except (InvalidNamespaceException, InvalidNodeNameException, InvalidTopicNameException,
             ParameterException) as error:
         raise RosError(_first_line(error)) from None

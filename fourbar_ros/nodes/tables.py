@@ -24,10 +24,12 @@ import sys
 from fourbar_ros.control.parameters import PARAMETERS as CONTROLLER_PARAMETERS
 from fourbar_ros.estimation.parameters import PARAMETERS as ESTIMATOR_PARAMETERS
 from fourbar_ros.loop import load_scenario
-from fourbar_ros.nodes import plant
+from fourbar_ros.nodes import hardware, plant, prototype_emulator
 
 TABLES = {
     'plant': plant.PARAMETERS,
+    'hardware': hardware.PARAMETERS,
+    'prototype_emulator': prototype_emulator.PARAMETERS,
     'estimator': ESTIMATOR_PARAMETERS,
     'controller': CONTROLLER_PARAMETERS,
 }

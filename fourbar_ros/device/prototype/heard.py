@@ -205,6 +205,9 @@ class HeardLink:
         known_ns = self._boot_ns.get(boot)
         self._boot_ns[boot] = now_ns
         if boot == self._boot:
+            if self.twins and all(now_ns - heard_ns > BOOT_MEMORY_NS for other, heard_ns
+                                  in self._boot_ns.items() if other != boot):
+                self.twins = 0
             return
         if self._boot is not None:
             if known_ns is not None and now_ns - known_ns < BOOT_MEMORY_NS:

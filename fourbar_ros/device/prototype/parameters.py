@@ -1,0 +1,58 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How the prototype is reached: the parameters that host and emulator have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fourbar_ros.device.prototype.messages import Codec
+from fourbar_ros.device.prototype.port import open_port, Port
+from fourbar_ros.parameters import Parameter
+
+CODECS = ('prototype', 'odrive')
+
+BUS_PARAMETERS = (
+    Parameter('bus.interface', 'socketcan', '', 'interface of python-can, as socketcan, slcan, '
+              'serial, udp_multicast, virtual or fourbar_udp'),
+    Parameter('bus.channel', 'can0', '', 'channel of the interface, as can0 or HOST:PORT'),
+    Parameter('bus.bitrate', 1_000_000, 'bit/s', 'of interfaces that have one',
+              limits=(10_000, 1_000_000)),
+    Parameter('bus.options', '', '', 'more for the interface, as key=value, with spaces between'),
+    Parameter('codec', 'prototype', '', 'what is spoken on the bus', choices=CODECS),
+    Parameter('dbc', 'prototype', '', 'preset or path of the DBC file of codec prototype'),
+)
+
+
+def open_bus(values: Mapping[str, Any]) -> Port:
+    """
+    Open the bus that parameters describe.
+
+    :raises BusError: it cannot be.
+    """
+    return open_port(values['bus.interface'], values['bus.channel'], values['bus.bitrate'],
+                     values['bus.options'])
+
+
+def make_codec(values: Mapping[str, Any]) -> Codec:
+    """
+    Make the codec that parameters name.
+
+    :raises FourbarError: the DBC file is not there or refused.
+    """
+    from fourbar_ros.device.prototype.dbc_codec import DbcCodec
+    from fourbar_ros.device.prototype.odrive_codec import OdriveCodec
+    return (OdriveCodec if values['codec'] == 'odrive' else DbcCodec)(values['dbc'])

@@ -1,0 +1,457 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The prototype as a device: four links on a bus.
+
+At every tick the host asks all links at once for their wheels (`Sync`) and waits a moment for the
+answers; what the links say by themselves, their angles above all, is taken along. Commands go out
+as soon as they are there. While the gate is closed every tick tells all links so.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from fourbar_ros.device.gate import DeviceState
+from fourbar_ros.device.protocol import (
+    Device,
+    Drive,
+    Finding,
+    no_torque,
+    Reaction,
+    Samples,
+    WheelSample,
+)
+from fourbar_ros.device.prototype.heard import COUNTERS, HeardLink
+from fourbar_ros.device.prototype.messages import (
+    AngleReport,
+    BusError,
+    ClockReport,
+    Codec,
+    Command,
+    Frame,
+    FrameError,
+    Heartbeat,
+    Limits,
+    LinkState,
+    MotorReport,
+    Release,
+    Stop,
+    Sync,
+    WheelReport,
+)
+from fourbar_ros.device.prototype.safety import SafetyTable, SafetyWatch
+from fourbar_ros.mechanism import LINK_NAMES, Mechanism
+from fourbar_ros.plant import SensorReading
+import numpy as np
+
+LINKS = range(4)
+
+# A frame that nobody waits for is taken as long as it is there at once; but not for ever, should
+# somebody flood the bus.
+MOST_FRAMES = 2000
+
+# Counters of frames that are no good, whose sum per second is watched.
+BAD = ('length', 'checksum', 'value', 'replayed', 'late', 'wrong_time', 'foreign')
+
+# How often the last command is repeated when the host leaves.
+LAST_WORDS = 3
+
+
+class Bus(Protocol):
+    """What sends and receives frames; times are of the host's steady clock [ns]."""
+
+    def send(self, frame: Frame) -> None:
+        """
+        Send a frame.
+
+        :raises BusError: the bus is gone.
+        """
+
+    def receive(self, timeout_s: float) -> tuple[Frame, int] | None:
+        """
+        Wait for a frame.
+
+        :returns: the frame and when it arrived, None if none came in time.
+        :raises BusError: the bus is gone.
+        """
+
+    def close(self) -> None:
+        """Leave the bus."""
+
+    def facts(self) -> dict[str, object]:
+        """Tell what a person wants to know of it."""
+
+
+class Prototype(Device):
+    """
+    Four links behind the device protocol.
+
+    :param mechanism: the linkage, its wheels, motor limits and offsets of the angle sensors.
+    :param open_bus: called to open the bus, now and again after it failed; raises `BusError`.
+    :param codec: what is spoken on it.
+    :param safety: limits and reactions.
+    :param period_ns: time between two ticks [ns].
+    :param answer_timeout_s: how long a tick waits for the answers of the wheels [s].
+    :param gyro: whether the links have gyros.
+    :param steady_ns: reads the host's steady clock [ns].
+    :param stamp_of: turns its times into stamps [ns].
+    """
+
+    description = 'prototype'
+    sensor_names = LINK_NAMES
+    timing_names = ('bus_round_trip_s', 'angle_age_s', 'clock_jitter_s')
+
+    def __init__(self, mechanism: Mechanism, open_bus: Callable[[], Bus], codec: Codec,
+                 safety: SafetyTable, period_ns: int, answer_timeout_s: float, gyro: bool,
+                 steady_ns: Callable[[], int], stamp_of: Callable[[int], int]) -> None:
+        self.mechanism = mechanism
+        self.period_ns = period_ns
+        self.measures_rates = gyro
+        self.links = [HeardLink(codec.has_clock) for _ in LINKS]
+        self._codec = codec
+        self._open_bus = open_bus
+        self._bus: Bus | None = open_bus()
+        self._steady_ns = steady_ns
+        self._stamp_of = stamp_of
+        self._answer_timeout_ns = round(answer_timeout_s * 1e9)
+        self._safety = SafetyWatch(safety)
+        self._counts: Counter[str] = Counter()
+        self._state = DeviceState.DISARMED
+        self._drive = no_torque()
+        self._since_ns = steady_ns()
+        self._sequences = [0, 0, 0, 0]
+        self._counter = 0
+        self._sent_ns = [0] * COUNTERS
+        self._findings: tuple[Finding, ...] = ()
+        self._armed_boots = [0, 0, 0, 0]
+        self._bad = 0
+        self._bad_since_ns = self._since_ns
+
+    def step(self, stamp_ns: int, drive: Drive) -> Samples:
+        """
+        Ask the wheels, take along what else was said, and look whether all is well.
+
+        :raises BusError: the bus is gone; the next step tries to open it again.
+        """
+        if self._bus is None:
+            self._bus = self._open_bus()
+        try:
+            round_trip_ns = self._ask(drive)
+        except BusError:
+            self._lose_bus()
+            raise
+        now_ns = self._steady_ns()
+        self._look(now_ns)
+        return self._samples(stamp_ns, now_ns, round_trip_ns)
+
+    def drive(self, drive: Drive) -> None:
+        """
+        Send it.
+
+        :raises BusError: the bus is gone.
+        """
+        self._drive = drive
+        if self._bus is None:
+            return
+        try:
+            self._send_drive(drive)
+        except BusError:
+            self._lose_bus()
+            raise
+
+    def gate_changed(self, state: DeviceState) -> None:
+        """Stop or release the links at once, and remember how they are when they are armed."""
+        was, self._state = self._state, state
+        if state is DeviceState.ARMED:
+            self._since_ns = self._steady_ns()
+            self._armed_boots = [link.boots for link in self.links]
+        if self._bus is None:
+            return
+        try:
+            if state is DeviceState.EMERGENCY_STOP:
+                self._send(Stop())
+            elif was is DeviceState.EMERGENCY_STOP:
+                self._send(Release())
+        except BusError:
+            self._lose_bus()
+
+    def obstacles(self) -> Sequence[str]:
+        """Tell what speaks against arming: links, wheels, clocks, and what must not go on."""
+        told = [f'{name}: {text}' for name, link in zip(LINK_NAMES, self.links)
+                for text in self._obstacles_of(link)]
+        told += [finding.text for finding in self._safety.findings()
+                 if finding.reaction is not Reaction.WARN and finding.text not in told]
+        return told
+
+    def findings(self) -> Sequence[Finding]:
+        """Tell what was found at the last step that must have consequences."""
+        return self._findings
+
+    def diagnosis(self) -> dict[str, str]:
+        """Tell what is not as it should be."""
+        if self._bus is None:
+            return {'bus': 'the bus is closed'}
+        told = {}
+        if missing := [name for name, link in zip(LINK_NAMES, self.links)
+                       if link.heartbeat_ns is None]:
+            told['missing'] = f'waiting for {", ".join(missing)}: never heard'
+        for finding in self._safety.findings():
+            told[finding.text.partition(':')[0]] = finding.text
+        return told
+
+    def facts(self) -> dict[str, object]:
+        """Tell counters of the bus, and of each link its health and its clock."""
+        told: dict[str, object] = {} if self._bus is None else self._bus.facts()
+        told.update({f'frames_{kind}': count for kind, count in sorted(self._counts.items())})
+        for name, link in zip(LINK_NAMES, self.links):
+            beat = link.heartbeat
+            if beat is None:
+                continue
+            told[f'{name}.state'] = '' if link.state is None else link.state.name.lower()
+            told[f'{name}.faults'] = ', '.join(sorted(beat.faults))
+            if beat.voltage is not None:
+                told[f'{name}.voltage_v'] = f'{beat.voltage:.2f}'
+            if beat.temperature is not None:
+                told[f'{name}.temperature_deg_c'] = f'{beat.temperature:.1f}'
+            told[f'{name}.clock_drift_ppm'] = f'{link.clock.drift * 1e6:.2f}'
+            told[f'{name}.clock_jitter_us'] = f'{link.clock.jitter * 1e6:.1f}'
+            told[f'{name}.restarts'] = link.boots
+            told.update({f'{name}.{kind}': count for kind, count in sorted(link.counts.items())})
+        return told
+
+    def close(self) -> None:
+        """Tell all links that they have no power, and leave the bus."""
+        bus, self._state = self._bus, DeviceState.DISARMED
+        if bus is None:
+            return
+        try:
+            for _ in range(LAST_WORDS):
+                self._send_drive(no_torque())
+        except BusError:
+            pass
+        self._bus = None
+        bus.close()
+
+    # The exchange
+
+    def _ask(self, drive: Drive) -> int | None:
+        """
+        Send what belongs to a tick, and take all that is there.
+
+        :returns: time until all wheels had answered, None if they did not [ns].
+        """
+        self._take_waiting()
+        counter = self._counter = (self._counter + 1) % COUNTERS
+        for link in self.links:
+            link.asked()
+        if self._state is DeviceState.EMERGENCY_STOP:
+            # Again and again: one that starts anew must not miss it.
+            self._send(Stop())
+        elif self._state is not DeviceState.ARMED:
+            self._send_drive(drive)
+        sent_ns = self._sent_ns[counter] = self._steady_ns()
+        self._send(Sync(counter))
+        expected = [link for link in self.links if link.answer_ns is not None] or self.links
+        deadline_ns = sent_ns + self._answer_timeout_ns
+        while not all(link.complete for link in expected):
+            left_ns = deadline_ns - self._steady_ns()
+            if left_ns <= 0 or not self._take_next(left_ns * 1e-9):
+                break
+        self._take_waiting()
+        if not all(link.complete for link in self.links):
+            return None
+        return max(link.answer_ns or 0 for link in self.links) - sent_ns
+
+    def _take_waiting(self) -> None:
+        for _ in range(MOST_FRAMES):
+            if not self._take_next(0.0):
+                return
+
+    def _take_next(self, timeout_s: float) -> bool:
+        """Wait for a frame and take it; tell whether one came."""
+        assert self._bus is not None
+        received = self._bus.receive(timeout_s)
+        if received is None:
+            return False
+        frame, arrival_ns = received
+        try:
+            report = self._codec.from_links(frame)
+        except FrameError as error:
+            self._counts[error.kind] += 1
+            return True
+        if report is None:
+            self._counts['foreign'] += 1
+            return True
+        link = self.links[report.link]
+        if isinstance(report, WheelReport):
+            link.take_wheel(report, self._counter, self._sent_ns[self._counter], arrival_ns)
+        elif isinstance(report, MotorReport):
+            link.take_motor(report)
+        elif isinstance(report, AngleReport):
+            link.take_angle(report, arrival_ns)
+        elif isinstance(report, ClockReport):
+            link.take_clock(report, self._sent_at(report.counter, arrival_ns), arrival_ns)
+        else:
+            self._take_heartbeat(report, link, arrival_ns)
+        return True
+
+    def _sent_at(self, counter: int, arrival_ns: int) -> int | None:
+        """Return when a `Sync` went out, None if there was none with this counter lately."""
+        sent_ns = self._sent_ns[counter]
+        return sent_ns if 0 <= arrival_ns - sent_ns < 0.5 * COUNTERS * self.period_ns else None
+
+    def _take_heartbeat(self, report: Heartbeat, link: HeardLink, arrival_ns: int) -> None:
+        link.take_heartbeat(report, arrival_ns)
+        if 'no_limits' in report.faults:
+            self._send(Limits(
+                report.link, float(self.mechanism.motor_torque_limits[report.link]),
+                float(self.mechanism.motor_speed_limits[report.link])))
+
+    def _send_drive(self, drive: Drive) -> None:
+        for link in LINKS:
+            powered = bool(drive.powered[link])
+            self._sequences[link] = (self._sequences[link] + 1) % COUNTERS
+            self._send(Command(
+                link, float(drive.values[link]) if powered else 0.0,
+                powered and bool(drive.by_speed[link]), powered, self._sequences[link]))
+
+    def _send(self, message: Command | Limits | Sync | Stop | Release) -> None:
+        assert self._bus is not None
+        for frame in self._codec.to_links(message):
+            self._bus.send(frame)
+
+    def _lose_bus(self) -> None:
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            bus.close()
+
+    # What comes of it
+
+    def _samples(self, stamp_ns: int, now_ns: int, round_trip_ns: int | None) -> Samples:
+        shift_ns = self._stamp_of(now_ns) - now_ns
+        offsets = self.mechanism.link_angle_offsets
+        readings = []
+        for index, (name, link) in enumerate(zip(LINK_NAMES, self.links)):
+            while link.angles:
+                measured_ns, angle, rate = link.angles.popleft()
+                angle -= offsets[index]
+                rates = np.empty(0)
+                if self.measures_rates:
+                    if rate is None:
+                        continue
+                    rates = np.array([rate])
+                readings.append(SensorReading(
+                    measured_ns + shift_ns, (name,),
+                    np.array([np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi]), rates))
+        readings.sort(key=lambda reading: reading.stamp_ns)
+        silent_ns = self._safety.table['wheel_silent'].limit * 1e9
+        complete = all(link.answer_ns is not None and now_ns - link.answer_ns <= silent_ns
+                       for link in self.links)
+        tick_ns = stamp_ns - shift_ns
+        wheels = WheelSample(
+            np.array([link.wheel_at(tick_ns) if link.wheel_ns is not None else 0.0
+                      for link in self.links]),
+            np.array([link.wheel_speed for link in self.links]),
+            np.array([link.torque for link in self.links]))
+        ages = [now_ns - link.angle_ns for link in self.links if link.angle_ns is not None]
+        return Samples(
+            stamp_ns, tuple(readings), wheels, complete=complete, timing=(
+                None if round_trip_ns is None else round_trip_ns * 1e-9,
+                max(ages) * 1e-9 if ages else None,
+                max(link.clock.jitter for link in self.links)))
+
+    def _obstacles_of(self, link: HeardLink) -> list[str]:
+        if link.heartbeat_ns is None:
+            return ['was never heard']
+        told = []
+        if link.answer_ns is None:
+            told.append('its wheel was never heard')
+        if not link.clock.settled:
+            told.append('its clock is not known yet')
+        if link.state not in (LinkState.IDLE, LinkState.COASTING, None):
+            told.append(f'its electronics say {link.state.name.lower()}')
+        limit = self._safety.table['wheel_speed_to_arm'].limit
+        if abs(link.wheel_speed) > limit:
+            told.append(f'its wheel turns at {abs(link.wheel_speed):.3g} rad/s, limit {limit:g}')
+        return told
+
+    def _look(self, now_ns: int) -> None:
+        """Compare everything with its limit."""
+        for index, (name, link) in enumerate(zip(LINK_NAMES, self.links)):
+            if link.heartbeat_ns is not None:
+                self._look_at(index, name, link, now_ns)
+        bad = sum(self._counts[kind] + sum(link.counts[kind] for link in self.links)
+                  for kind in BAD)
+        elapsed_s = (now_ns - self._bad_since_ns) * 1e-9
+        if elapsed_s >= 1.0:
+            rate = (bad - self._bad) / elapsed_s
+            self._safety.look(
+                'bad_frames', 'bus', rate > self._safety.table['bad_frames'].limit, rate,
+                '{0:.0f} frames a second are no good, limit {1:g}', now_ns)
+            self._bad, self._bad_since_ns = bad, now_ns
+        armed = self._state is DeviceState.ARMED
+        self._findings = tuple(
+            finding for finding in self._safety.findings()
+            if finding.reaction is not Reaction.WARN) if armed else ()
+
+    def _look_at(self, index: int, name: str, link: HeardLink, now_ns: int) -> None:
+        table, look = self._safety.table, self._safety.look
+        armed = self._state is DeviceState.ARMED
+        assert link.heartbeat_ns is not None
+        silence = (now_ns - (link.answer_ns or self._since_ns)) * 1e-9
+        look('wheel_silent', name, silence > table['wheel_silent'].limit, silence,
+             'its wheel has not answered for {0:.3g} s, limit {1:g}', now_ns)
+        silence = (now_ns - link.heartbeat_ns) * 1e-9
+        look('heartbeat_lost', name, silence > table['heartbeat_lost'].limit, silence,
+             'no heartbeat for {0:.3g} s, limit {1:g}', now_ns)
+        boots = link.boots - self._armed_boots[index] if armed else 0
+        look('reboot', name, boots > table['reboot'].limit, boots,
+             'it has started anew while it was armed', now_ns)
+        look('two_of_one_id', name, link.twins > table['two_of_one_id'].limit, link.twins + 1,
+             '{0} links answer to its id', now_ns)
+        powered = armed and bool(self._drive.powered[index])
+        state = '' if link.state is None else link.state.name.lower()
+        look('not_armed', name, powered and link.state not in (LinkState.ARMED, None), state,
+             'it was told to drive, but says that it is {0}', now_ns)
+        torque_limit = float(self.mechanism.motor_torque_limits[index])
+        speed_limit = table['overspeed'].limit * float(self.mechanism.motor_speed_limits[index])
+        speed = abs(link.wheel_speed)
+        look('overspeed', name, speed > speed_limit, speed,
+             f'its wheel turns at {{0:.4g}} rad/s, limit {speed_limit:.4g}', now_ns)
+        look('unasked_torque', name, not powered and armed
+             and abs(link.torque) > table['unasked_torque'].limit * torque_limit, link.torque,
+             'its motor gives {0:.3g} N m without power', now_ns)
+        asked = float(self._drive.values[index])
+        by_torque = powered and not bool(self._drive.by_speed[index])
+        look('disagreement', name, by_torque and abs(asked - link.torque)
+             > table['disagreement'].limit * torque_limit, link.torque - asked,
+             'its motor is {0:.3g} N m off what it was told', now_ns)
+        self._look_at_health(name, link, now_ns)
+
+    def _look_at_health(self, name: str, link: HeardLink, now_ns: int) -> None:
+        beat, table, look = link.heartbeat, self._safety.table, self._safety.look
+        assert beat is not None
+        faults = ', '.join(sorted(beat.faults - {'no_limits'}))
+        look('link_fault', name, bool(faults), faults, 'its electronics tell of {0}', now_ns)
+        for row in ('hot', 'overtemperature'):
+            look(row, name, beat.temperature is not None
+                 and beat.temperature > table[row].limit, beat.temperature,
+                 'it has {0:.3g} deg C, limit {1:g}', now_ns)
+        for row in ('low_voltage', 'undervoltage'):
+            look(row, name, beat.voltage is not None and beat.voltage < table[row].limit,
+                 beat.voltage, 'its supply has {0:.3g} V, at least {1:g}', now_ns)
