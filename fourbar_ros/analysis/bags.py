@@ -79,6 +79,30 @@ class JointSeries:
         """Return the messages with start_ns <= stamp <= end_ns."""
         return self.rows((self.stamp_ns >= start_ns) & (self.stamp_ns <= end_ns))
 
+    def at(self, stamp_ns: Nanoseconds) -> JointSeries:
+        """
+        Return what lies between the messages, on a straight line from one to the next.
+
+        :param stamp_ns: (m,) stamps; those before the first message or after the last are left
+            out, and so are those between two that are further apart than three times the usual.
+        """
+        steps = np.diff(self.stamp_ns)
+        after = np.searchsorted(self.stamp_ns, stamp_ns)
+        inside = (after > 0) & (after < len(self))
+        if inside.any():
+            inside[inside] = steps[after[inside] - 1] <= 3.0 * np.median(steps)
+        stamps = stamp_ns[inside]
+
+        def between(array: Floats, turns: bool = False) -> Floats:
+            continuous = np.unwrap(array, axis=0) if turns else array
+            # From a stamp near by: nanoseconds since 1970 do not fit a double.
+            times, wanted = self.stamp_ns - self.stamp_ns[0], stamps - self.stamp_ns[0]
+            return np.column_stack([np.interp(wanted, times, column) for column in continuous.T])
+
+        return JointSeries(
+            self.topic, stamps, self.received_ns[after[inside]], self.names,
+            between(self.position, turns=True), between(self.velocity), between(self.effort))
+
     def select(self, names: Sequence[str]) -> JointSeries:
         """Return these columns in this order, NaN for a name that never occurs."""
         def columns(array: Floats) -> Floats:

@@ -91,12 +91,19 @@ def pair(left: JointSeries, right: JointSeries, names: tuple[str, ...]) -> Paire
     """
     Bring together the messages of two topics that carry the same stamp.
 
+    Where there are none, since nobody ticks for both (as for the truth of an emulated prototype),
+    what lies between the messages on the right counts.
+
     :param left: in order of stamps, each once; so is right.
-    :raises BagError: no stamp occurs in both.
+    :raises BagError: no stamp of left is in both, or between messages of right.
     """
     stamps, in_left, in_right = np.intersect1d(
         left.stamp_ns, right.stamp_ns, assume_unique=True, return_indices=True)
     if not len(stamps):
+        between = right.select(names).at(left.stamp_ns)
+        if len(between):
+            known = np.isin(left.stamp_ns, between.stamp_ns)
+            return Paired(between.stamp_ns, left.select(names).rows(known), between)
         raise BagError(f'{left.topic} and {right.topic} have no stamp in common')
     return Paired(stamps, left.select(names).rows(in_left), right.select(names).rows(in_right))
 

@@ -25,6 +25,7 @@ from math import degrees
 import os
 from pathlib import Path
 import shutil
+import socket
 from typing import Any, TYPE_CHECKING
 
 from fourbar_ros.commands.files import OutputError, write_whole
@@ -35,7 +36,9 @@ import yaml
 if TYPE_CHECKING:
     from fourbar_ros.loop import Scenario
 
-NODES = ('plant', 'estimator', 'controller')
+# What is started for each device, before estimator and controller.
+DEVICES = {'simulated': ('plant',), 'prototype': ('prototype_emulator', 'hardware')}
+PRESETS = {'simulated': 'paper', 'prototype': 'prototype'}
 
 STATUSES = ('device_status', 'controller_status')
 JOINTS = (
@@ -86,8 +89,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     parser.add_argument('--output', metavar='DIR', type=Path, default=Path('demo_output'),
                         help='folder for bag, report and metrics (default demo_output)')
-    parser.add_argument('--preset', metavar='NAME', default='paper',
-                        help='scenario with one setpoint: paper (default), prototype or a file')
+    parser.add_argument('--device', choices=tuple(DEVICES), default='simulated',
+                        help='simulated (default): the plant; prototype: the hardware node, over '
+                             'a bus on this machine to emulated links')
+    parser.add_argument('--preset', metavar='NAME',
+                        help='scenario with one setpoint: paper (default), prototype (default of '
+                             'device prototype) or a file')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -104,17 +111,21 @@ def run(args: argparse.Namespace) -> int:
     with TestbedClient() as testbed, ExitStack() as stack:
         # At once, because what comes next takes seconds where somebody else computes.
         _refuse_second_plant(testbed)
-        scenario = _one_move(args.preset)
+        scenario = _one_move(args.preset or PRESETS[args.device])
         # Once here, or three nodes would do it side by side.
         from fourbar_ros.loop.warm_up import main as compile_kernels
         compile_kernels()
         _refuse_second_plant(testbed)
         stack.enter_context(_locked(args.output))
         _prepare(args.output)
-        parameters = _write_parameters(scenario, args.output / 'parameters.yaml')
+        parameters = _write_parameters(
+            scenario, args.device, args.output / 'parameters.yaml')
+        nodes = (*DEVICES[args.device], 'estimator', 'controller')
         with Processes(args.output / 'logs', os.environ) as processes:
-            _start(processes, args.output / 'bag', parameters)
+            _start(processes, nodes, args.output / 'bag', parameters)
             _move(testbed, processes, scenario, progress_bar)
+            processes.stop(*nodes)
+            processes.stop('record')
     print('Writing the report')
     metrics = write_report(args.output / 'bag', args.output / 'report.html',
                            args.output / 'metrics.json')
@@ -184,7 +195,7 @@ def _prepare(output: Path) -> None:
             f'cannot write to {error.filename or output}: {error.strerror}') from None
 
 
-def _write_parameters(scenario: Scenario, path: Path) -> list[str]:
+def _write_parameters(scenario: Scenario, device: str, path: Path) -> list[str]:
     """
     Write the parameters of the nodes.
 
@@ -192,6 +203,8 @@ def _write_parameters(scenario: Scenario, path: Path) -> list[str]:
     """
     parameters = scenario.parameters()
     parameters['plant']['command_timeout'] = PATIENCE
+    if device == 'prototype':
+        parameters.update(_on_a_bus(parameters.pop('plant')))
     parameters['controller']['setpoint_duration'] = _duration(scenario)
     with write_whole(path) as file:
         yaml.safe_dump({f'/**/{node}': {'ros__parameters': values}
@@ -199,18 +212,47 @@ def _write_parameters(scenario: Scenario, path: Path) -> list[str]:
     return ['--ros-args', '--params-file', str(path.absolute())]
 
 
+def _on_a_bus(plant: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Share the parameters of a plant out between the hardware node and the emulated links."""
+    of_the_table = {name: plant[name] for name in plant
+                    if name in ('mechanism', 'table', 'seed', 'step')
+                    or name.startswith('initial.')}
+    of_the_device = {name: plant[name] for name in (
+        'mechanism', 'rate', 'command_timeout', 'sensor_timeout', 'timeout_action')}
+    host, links = (f'127.0.0.1:{port}' for port in _free_ports(2))
+    bus = {'bus.interface': 'fourbar_udp'}
+    return {
+        'prototype_emulator': {
+            **of_the_table, **bus, 'bus.channel': links, 'bus.options': f'peers={host}',
+            'command_timeout': PATIENCE},
+        'hardware': {
+            **of_the_device, **bus, 'bus.channel': host, 'bus.options': f'peers={links}'},
+    }
+
+
+def _free_ports(count: int) -> list[int]:
+    """Find UDP ports that nobody uses now."""
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                   for _ in range(count)]
+        for one in sockets:
+            one.bind(('127.0.0.1', 0))
+        return [one.getsockname()[1] for one in sockets]
+
+
 def _duration(scenario: Scenario) -> float:
     """Return the time in which the setpoint is reached [s]."""
     return scenario.setpoints[0].duration or scenario.controller.setpoint_duration
 
 
-def _start(processes: Processes, bag: Path, parameters: Sequence[str]) -> None:
+def _start(processes: Processes, nodes: Sequence[str], bag: Path, parameters: Sequence[str]
+           ) -> None:
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
-    print(f'Starting {", ".join(NODES)}. Watch them from another terminal:\n'
+    print(f'Starting {", ".join(nodes)}. Watch them from another terminal:\n'
           f'  ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST '
           'ros2 topic echo /estimate/link_states', flush=True)
     processes.start('record', ['-o', str(bag)])
-    for name in NODES:
+    for name in nodes:
         processes.start(name, parameters)
 
 
@@ -262,8 +304,6 @@ def _move(testbed: Any, processes: Processes, scenario: Scenario, progress_bar: 
             return bool(elapsed >= duration)
         until(arrived, 'the motion did not end', 3.0 * duration)
     testbed.switch('arm', False)
-    processes.stop(*NODES)
-    processes.stop('record')
 
 
 def _armed(testbed: Any) -> bool:

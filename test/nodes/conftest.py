@@ -21,6 +21,7 @@ from importlib.util import module_from_spec, spec_from_file_location
 import os
 from pathlib import Path
 import signal
+from socket import AF_INET, SOCK_DGRAM, socket
 import subprocess
 import sys
 import tempfile
@@ -56,7 +57,10 @@ COMMAND = QoSProfile(depth=10)
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 # A node ends in this order, so that none complains about another one's silence.
-STOP_ORDER = ('controller', 'estimator', 'plant')
+STOP_ORDER = ('controller', 'estimator', 'plant', 'hardware', 'prototype_emulator')
+
+# What a testbed may be, with the processes that it takes, the one with its topics last.
+DEVICES = {'plant': ('plant',), 'hardware': ('prototype_emulator', 'hardware')}
 
 
 def stamp_of(message):
@@ -97,6 +101,18 @@ def claimed_domain():
                 path.unlink()
             return
     pytest.fail('every domain from 1 to 101 is taken')
+
+
+def on_a_bus():
+    """Return parameters with which a host and its links find each other, on free ports."""
+    with socket(AF_INET, SOCK_DGRAM) as host, socket(AF_INET, SOCK_DGRAM) as links:
+        for end in (host, links):
+            end.bind(('127.0.0.1', 0))
+        host, links = (f'127.0.0.1:{end.getsockname()[1]}' for end in (host, links))
+    return {name: {'bus.interface': 'fourbar_udp', 'bus.channel': own,
+                   'bus.options': f'peers={other}'}
+            for name, own, other in (
+                ('hardware', host, links), ('prototype_emulator', links, host))}
 
 
 class Process:
@@ -242,13 +258,31 @@ class Suite:
     def node(self, name, parameters=None, namespace='', arguments=(), fresh=False):
         """Start a node with parameters in a namespace; a plant waits long for commands."""
         ros_args = ['--ros-args']
-        patience = {'command_timeout': COMMAND_TIMEOUT_S} if name == 'plant' else {}
+        patience = ({'command_timeout': COMMAND_TIMEOUT_S}
+                    if name in ('plant', 'hardware', 'prototype_emulator') else {})
         for key, value in {**patience, **(parameters or {})}.items():
             ros_args += ['-p', f'{key}:={value}']
         if namespace:
             ros_args += ['-r', f'__ns:={namespace}']
         ros_args += arguments
         return self.start(name, *(ros_args if ros_args[1:] else ()), fresh=fresh)
+
+    def device(self, device, parameters=None, namespace='', emulator=None):
+        """
+        Start a testbed of the bench scale, simulated or on a bus, and return its processes.
+
+        :param parameters: of the node with the topics.
+        :param emulator: parameters of the emulated links, where there are some.
+        """
+        given = {name: {'mechanism': 'prototype'} for name in DEVICES[device]}
+        if device == 'plant':
+            given['plant']['table'] = 'prototype'
+        else:
+            for name, values in on_a_bus().items():
+                given[name].update(values)
+            given['prototype_emulator'].update(emulator or {})
+        given[device].update(parameters or {})
+        return {name: self.node(name, given[name], namespace) for name in DEVICES[device]}
 
     def nodes(self, namespace='', fresh=False, **parameters):
         """Start plant, estimator and controller; parameters by the name of the node."""
