@@ -65,6 +65,8 @@ LONGEST_GAP_NS = 1_000_000_000
 # How long the wheels alone carry the estimate; then it is lost.
 LONGEST_BLIND_NS = 1_000_000_000
 
+# What is measured within this time counts as measured at once, to start from [ns].
+TOGETHER_NS = 20_000_000
 # So many measurements in a row of which the gate refuses most mean that the filter is lost.
 LOST_AFTER = 10
 
@@ -175,6 +177,8 @@ class Estimator:
         self._misfits = 0
         self._corrected_ns = 0
         self._lost = False
+        # The last angle of each sensor while there is no estimate, with its stamp [ns].
+        self._before: dict[int, tuple[int, float]] = {}
         self._decisions: dict[int, Decision] = {}
         self._told: dict[int, Decision] = {}
         self._seen: list[tuple[Measurement, Correction]] = []
@@ -536,7 +540,7 @@ class Estimator:
     def _use(self, measurement: Measurement) -> Correction | None:
         """Correct the filter, or start it."""
         if self._filter is None:
-            self._start(measurement)
+            self._start(self._with_those_before(measurement))
             return None
         seen = self._filter.correct(
             measurement.sensors, measurement.values, self._variances_for(measurement.sensors),
@@ -550,8 +554,19 @@ class Estimator:
             self._misfits += 1
             if self._misfits >= LOST_AFTER:
                 # If this one does not tell enough, the wheels carry on.
-                self._start(measurement)
+                self._start(self._with_those_before(measurement))
         return seen
+
+    def _with_those_before(self, measurement: Measurement) -> Measurement:
+        """Add what others measured just before, where one measurement tells too little."""
+        for sensor, value in measurement.angles().items():
+            self._before[sensor] = measurement.stamp_ns, value
+        if np.isfinite(measurement.link_angles()).sum() >= 3:
+            return measurement
+        together = {sensor: value for sensor, (stamp_ns, value) in sorted(self._before.items())
+                    if 0 <= measurement.stamp_ns - stamp_ns <= TOGETHER_NS}
+        return Measurement(
+            measurement.stamp_ns, tuple(together), np.array(list(together.values())))
 
     def _variances_for(self, sensors: tuple[int, ...]) -> Array:
         found = self._variances_of.get(sensors)

@@ -71,15 +71,16 @@ class EmulatorNode(Node):
             raise TroubleError(f'links must be some of {LETTERS}, got {letters!r}')
         table = make_table(values, period_ns)
         self._bus = open_bus(values)
-        now_ns = steady_ns()
+        codec = make_codec(values)
+        now_ns, stamp_ns = steady_ns(), time.time_ns()
         offset, drift = values['clock_offset'], values['clock_drift']
         self._emulator = Emulator(
-            table, make_codec(values), [LETTERS.index(letter) for letter in letters],
+            table, codec, [LETTERS.index(letter) for letter in letters],
             FirmwareSettings(values['command_timeout']),
             ClockSettings(tuple(offset + 7.0 * link for link in range(4)),
                           (drift, 0.5 * drift, -0.5 * drift, -drift)),
             # Two that are started alike are two all the same.
-            np.random.default_rng(), now_ns, time.time_ns())
+            np.random.default_rng(), now_ns, stamp_ns)
         self._trouble(dict.fromkeys(TROUBLES, ''), values)
         self._truth_period_ns = round(1e9 / values['truth_rate'])
         self._truth = GroundTruth(self, table, self._truth_period_ns)

@@ -53,6 +53,8 @@ def make_codec(values: Mapping[str, Any]) -> Codec:
 
     :raises FourbarError: the DBC file is not there or refused.
     """
+    if values['codec'] == 'odrive':
+        from fourbar_ros.device.prototype.odrive_codec import OdriveCodec
+        return OdriveCodec(values['dbc'])
     from fourbar_ros.device.prototype.dbc_codec import DbcCodec
-    from fourbar_ros.device.prototype.odrive_codec import OdriveCodec
-    return (OdriveCodec if values['codec'] == 'odrive' else DbcCodec)(values['dbc'])
+    return DbcCodec(values['dbc'])

@@ -73,7 +73,20 @@ LAST_WORDS = 3
 
 
 class Bus(Protocol):
-    """What sends and receives frames; times are of the host's steady clock [ns]."""
+    """
+    What sends and receives frames; times are of the host's steady clock [ns].
+
+    :ivar sent, received, errors, dropped: number of frames.
+    """
+
+    sent: int
+    received: int
+    errors: int
+    dropped: int
+
+    @property
+    def trouble(self) -> str | None:
+        """Tell what is wrong with the bus itself, None if nothing is known."""
 
     def send(self, frame: Frame) -> None:
         """
@@ -92,9 +105,6 @@ class Bus(Protocol):
 
     def close(self) -> None:
         """Leave the bus."""
-
-    def facts(self) -> dict[str, object]:
-        """Tell what a person wants to know of it."""
 
 
 class Prototype(Device):
@@ -206,7 +216,9 @@ class Prototype(Device):
         """Tell what is not as it should be."""
         if self._bus is None:
             return {'bus': 'the bus is closed'}
-        told = {}
+        told: dict[str, str] = {}
+        if trouble := self._bus.trouble:
+            told['bus'] = trouble
         if missing := [name for name, link in zip(LINK_NAMES, self.links)
                        if link.heartbeat_ns is None]:
             told['missing'] = f'waiting for {", ".join(missing)}: never heard'
@@ -216,7 +228,10 @@ class Prototype(Device):
 
     def facts(self) -> dict[str, object]:
         """Tell counters of the bus, and of each link its health and its clock."""
-        told: dict[str, object] = {} if self._bus is None else self._bus.facts()
+        told: dict[str, object] = {}
+        if self._bus is not None:
+            told = {f'frames_{kind}': getattr(self._bus, kind)
+                    for kind in ('sent', 'received', 'errors', 'dropped')}
         told.update({f'frames_{kind}': count for kind, count in sorted(self._counts.items())})
         for name, link in zip(LINK_NAMES, self.links):
             beat = link.heartbeat

@@ -49,7 +49,7 @@ class Wire:
     :ivar delays_ns: from and to: each way takes a random time between the two.
     :ivar loss: share of frames that get lost.
     :ivar broken: whether it is gone.
-    :ivar sent: what the host said lately.
+    :ivar said: what the host said lately.
     """
 
     emulators: list[Emulator] = field(default_factory=list)
@@ -57,7 +57,12 @@ class Wire:
     delays_ns: tuple[int, int] = (60_000, 200_000)
     loss: float = 0.0
     broken: bool = False
-    sent: deque[Frame] = field(default_factory=lambda: deque(maxlen=1000))
+    trouble: str | None = None
+    said: deque[Frame] = field(default_factory=lambda: deque(maxlen=1000))
+    sent: int = 0
+    received: int = 0
+    errors: int = 0
+    dropped: int = 0
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(1))
     _number: count[int] = field(default_factory=count)
     _to_links: list[tuple[int, int, Frame]] = field(default_factory=list)
@@ -67,7 +72,8 @@ class Wire:
         """Put a frame on its way."""
         if self.broken:
             raise BusError('the bus is gone')
-        self.sent.append(frame)
+        self.said.append(frame)
+        self.sent += 1
         self._push(self._to_links, frame, self.now_ns)
 
     def receive(self, timeout_s: float) -> tuple[Frame, int] | None:
@@ -109,10 +115,6 @@ class Wire:
 
     def close(self) -> None:
         """Leave it as it is."""
-
-    def facts(self) -> dict[str, object]:
-        """Nothing is known of a wire."""
-        return {}
 
     def _push(self, queue: list[tuple[int, int, Frame]], frame: Frame, now_ns: int) -> None:
         if self.rng.random() >= self.loss:
