@@ -80,10 +80,11 @@ class OdriveCodec:
     change, and voltage and temperature are told with the next heartbeat. Until `Limits` were
     written to a link its heartbeats say `no_limits`, for an ODrive does not know.
 
+    :param sensors: of the sensor boards, `prototype` for config/prototype.dbc, or the path of a
+        file.
+    :param name: of the ODrives, `odrive` for config/odrive.dbc, or the path of a file.
     :param torque_constants: of the four motors [N m/A], because an ODrive limits current; None
-        leaves the limits to its own configuration: `Limits` are not written.
-    :param name: `odrive` for config/odrive.dbc, or the path of a file.
-    :param sensors: of the sensor boards, as for `DbcCodec`.
+        leaves the limits to its own configuration: `Limits` are neither written nor understood.
     :ivar frame_ids: of all its messages.
     :raises DbcError: a file is no DBC, lacks a message or a signal, or both use one identifier.
     :raises BusError: torque constants that are not positive and finite.
@@ -93,8 +94,8 @@ class OdriveCodec:
     has_angles = True
     has_clock = True
 
-    def __init__(self, torque_constants: Sequence[float] | None = None, name: str = 'odrive',
-                 sensors: str = 'prototype') -> None:
+    def __init__(self, sensors: str = 'prototype', name: str = 'odrive',
+                 torque_constants: Sequence[float] | None = None) -> None:
         if torque_constants is not None and not (len(torque_constants) == len(LINKS) and all(
                 isfinite(constant) and constant > 0.0 for constant in torque_constants)):
             raise BusError('ODrives need four torque constants, positive and finite, got '
