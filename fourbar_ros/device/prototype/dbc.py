@@ -372,8 +372,8 @@ class DbcFile:
             raise DbcError(f'{self.path}: {error.strerror}') from error
         except Exception as error:
             # The parser lets through whatever a malformed line leads to.
-            raise DbcError(f'{self.path} is no DBC file: {" ".join(str(error).split())}'
-                           ) from error
+            raise DbcError(f'{self.path} is no DBC file that can be used: '
+                           f'{" ".join(str(error).split())}') from error
         self._messages: list[Message] = list(getattr(database, 'messages', ()))
 
     def layout(self, name: str, checked: bool = True) -> Layout:

@@ -158,6 +158,19 @@ class Port:
         return Frame(message.arbitration_id, bytes(message.data), message.is_remote_frame), (
             now_ns - int(age_s * 1e9))
 
+    def facts(self) -> dict[str, object]:
+        """Tell what a person wants to know of the bus."""
+        told: dict[str, object] = {
+            'bus': self.name, 'frames_sent': self.sent, 'frames_received': self.received,
+            'error_frames': self.errors, 'frames_dropped': self.dropped}
+        # What fourbar_udp counts beside.
+        for name in ('foreign', 'malformed', 'unreachable'):
+            if hasattr(self._bus, name):
+                told[f'datagrams_{name}'] = getattr(self._bus, name)
+        if trouble := self.trouble:
+            told['bus_trouble'] = trouble
+        return told
+
     def close(self) -> None:
         """Close the bus, if it is not yet."""
         bus, self._bus = self._bus, None
