@@ -203,3 +203,9 @@ def world() -> World:
     world = World()
     world.run(1.0)
     return world
+
+
+@pytest.fixture
+def make_world() -> type[World]:
+    """Return what makes a world."""
+    return World

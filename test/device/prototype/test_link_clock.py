@@ -1,0 +1,91 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The clock of a link, found from exchanges over a bus that takes its time."""
+
+from fourbar_ros.device.prototype.clock import ENOUGH, LinkClock
+import numpy as np
+import pytest
+
+START_NS, STEP_NS = 3_000_000_000, 64_000_000
+
+
+def link_us(host_ns: int, offset_s: float, drift: float) -> int:
+    return round((offset_s + (host_ns - START_NS) * 1e-9 * (1.0 + drift)) * 1e6)
+
+
+def exchanges(clock: LinkClock, rng: np.random.Generator, count: int, drift: float,
+              slowest_s: float, offset_s: float = 77.0, begin_ns: int = START_NS) -> int:
+    """Ask so often; both ways take a least time and a random one. Return when it ended."""
+    now_ns = begin_ns
+    for _ in range(count):
+        there, back = (6e-5 + rng.exponential(slowest_s) for _ in range(2))
+        at_ns = now_ns + round(there * 1e9)
+        clock.exchange(now_ns, at_ns + round(back * 1e9), link_us(at_ns, offset_s, drift))
+        now_ns += STEP_NS
+    return now_ns
+
+
+@pytest.mark.parametrize('drift', [-1e-4, 0.0, 3e-5, 1e-4])
+@pytest.mark.parametrize(('slowest_s', 'allowed_s'), [(1e-5, 1e-5), (5e-4, 1e-4), (3e-3, 1e-3)])
+def test_times_of_the_link_are_found(drift: float, slowest_s: float, allowed_s: float) -> None:
+    for seed in range(5):
+        clock, rng = LinkClock(), np.random.default_rng(seed)
+        now_ns = exchanges(clock, rng, 500, drift, slowest_s)
+        error_s = (clock.host_ns(link_us(now_ns, 77.0, drift)) - now_ns) * 1e-9
+        assert abs(error_s) < allowed_s, f'seed {seed}'
+        # In between, by hundreds of milliseconds of drift at most.
+        assert clock.link_us(now_ns) == pytest.approx(
+            link_us(now_ns, 77.0, drift), abs=1e6 * allowed_s)
+
+
+def test_clock_is_settled_after_a_few_exchanges_and_not_before() -> None:
+    clock, rng = LinkClock(), np.random.default_rng(0)
+    exchanges(clock, rng, ENOUGH - 1, 0.0, 1e-5)
+    assert not clock.settled
+    exchanges(clock, rng, 1, 0.0, 1e-5, begin_ns=START_NS + 10 * STEP_NS)
+    assert clock.settled
+
+
+def test_clock_of_another_start_is_taken_up() -> None:
+    clock, rng = LinkClock(), np.random.default_rng(0)
+    now_ns = exchanges(clock, rng, 100, 2e-5, 1e-4)
+    now_ns = exchanges(clock, rng, 100, 2e-5, 1e-4, offset_s=0.5, begin_ns=now_ns)
+    assert clock.restarts == 1
+    assert abs(clock.host_ns(link_us(now_ns, 0.5, 2e-5)) - now_ns) < 100_000
+
+
+def test_one_lying_exchange_is_left_out() -> None:
+    clock, rng = LinkClock(), np.random.default_rng(0)
+    now_ns = exchanges(clock, rng, 100, 2e-5, 1e-4)
+    assert not clock.exchange(now_ns, now_ns + 200_000, link_us(now_ns, 77.0, 2e-5) + 50_000)
+    assert abs(clock.host_ns(link_us(now_ns, 77.0, 2e-5)) - now_ns) < 100_000
+
+
+def test_slow_answer_and_one_from_before_the_question_say_nothing() -> None:
+    clock = LinkClock()
+    assert not clock.exchange(START_NS, START_NS + 10 ** 9, 5)
+    assert not clock.exchange(START_NS, START_NS - 1, 5)
+    assert clock.exchanges == 0
+
+
+@pytest.mark.parametrize('wrap_us', [2 ** 20, 10 * 2 ** 20, 2 ** 32])
+@pytest.mark.parametrize('away_s', [-0.4, -0.001, 0.0, 0.4])
+def test_times_that_start_over_are_told_apart(wrap_us: int, away_s: float) -> None:
+    clock, rng = LinkClock(), np.random.default_rng(0)
+    now_ns = exchanges(clock, rng, 2000, 3e-5, 1e-5, offset_s=4000.0)
+    then_ns = now_ns + round(away_s * 1e9)
+    time_us = link_us(then_ns, 4000.0, 3e-5)
+    found = clock.unwrapped(time_us % wrap_us, wrap_us, now_ns)
+    assert abs(clock.host_ns(found) - then_ns) < 50_000
