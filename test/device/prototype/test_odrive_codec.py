@@ -185,6 +185,9 @@ def test_frames_are_those_of_the_manual():
 def test_sync_asks_everybody():
     """The sensor boards by `SYNC`, every ODrive for wheel and motor, and one now and again."""
     host, link = make(), make()
+    assert max(len(host.to_links(Sync(counter))) for counter in range(16)) == 9
+    for node in range(4):
+        host.from_links(heartbeat(node, 0, 1))
     seldom = []
     for counter in range(16):
         sync, *asked = host.to_links(Sync(counter))
