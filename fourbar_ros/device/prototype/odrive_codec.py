@@ -122,7 +122,8 @@ class OdriveCodec:
         if isinstance(message, Sync):
             asked = [frame for axis in self._axes for frame in axis.ask]
             link = message.counter % _SELDOM
-            if link in LINKS:
+            # Not before it was heard: what it says of itself goes with a heartbeat.
+            if link in LINKS and self._axes[link].heard:
                 asked += self._axes[link].ask_seldom
             return [*self._sensors.to_links(message), *asked]
         if isinstance(message, Stop):
@@ -254,6 +255,11 @@ class _Axis:
             [Frame(message.frame_id, b'', True) for message in messages]
             for messages in ((self._estimates, self._torques), (self._bus, self._hot)))
 
+    @property
+    def heard(self) -> bool:
+        """Whether a heartbeat came."""
+        return self._heartbeat is not None
+
     # The host writes
 
     def estop(self) -> Frame:
@@ -366,14 +372,6 @@ class _Axis:
             'Torque_Estimate': self._torque_estimate.write(message.torque)})]
 
     def tell_health(self, message: Heartbeat) -> list[Frame]:
-        frames = []
-        if message.voltage is not None:
-            frames.append(self._bus.frame({
-                'Bus_Voltage': self._bus_voltage.write(message.voltage)}))
-        if message.temperature is not None:
-            frames.append(self._hot.frame({
-                name: number.write(message.temperature)
-                for name, number in self._temperatures.items()}))
         error = sum(bits[0] for fault, bits in _ERRORS.items() if fault in message.faults)
         if 'driver' in message.faults:
             error |= _DRIVER
@@ -381,8 +379,15 @@ class _Axis:
             error = _SYSTEM_LEVEL
         error |= {LinkState.STOPPED: _ESTOP, LinkState.COASTING: _WATCHDOG}.get(message.state, 0)
         armed = message.state is LinkState.ARMED
-        frames.append(self._beat.frame({
-            'Axis_Error': error, 'Axis_State': _CLOSED_LOOP if armed else _IDLE}))
+        frames = [self._beat.frame({
+            'Axis_Error': error, 'Axis_State': _CLOSED_LOOP if armed else _IDLE})]
+        if message.voltage is not None:
+            frames.append(self._bus.frame({
+                'Bus_Voltage': self._bus_voltage.write(message.voltage)}))
+        if message.temperature is not None:
+            frames.append(self._hot.frame({
+                name: number.write(message.temperature)
+                for name, number in self._temperatures.items()}))
         return frames
 
     # The link reads
