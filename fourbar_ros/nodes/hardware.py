@@ -42,8 +42,9 @@ class HardwareNode(device_node.DeviceNode):
 
 def make_device(values, period_ns, stamp_of):
     """Reach the prototype that the parameters describe."""
+    mechanism = load_mechanism(values['mechanism'])
     return Prototype(
-        load_mechanism(values['mechanism']), lambda: open_bus(values), make_codec(values),
+        mechanism, lambda: open_bus(values), make_codec(values, mechanism),
         load_safety(values['safety']), period_ns, values['answer_timeout'], values['gyro'],
         steady_ns, stamp_of)
 

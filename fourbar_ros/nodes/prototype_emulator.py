@@ -71,7 +71,7 @@ class EmulatorNode(Node):
             raise TroubleError(f'links must be some of {LETTERS}, got {letters!r}')
         table = make_table(values, period_ns)
         self._bus = open_bus(values)
-        codec = make_codec(values)
+        codec = make_codec(values, table.mechanism)
         now_ns, stamp_ns = steady_ns(), time.time_ns()
         offset, drift = values['clock_offset'], values['clock_drift']
         self._emulator = Emulator(

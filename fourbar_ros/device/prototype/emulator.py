@@ -182,7 +182,8 @@ class Emulator:
         :returns: the answers.
         :raises BusError: somebody else speaks for one of these links.
         """
-        if self._troubles.get('bus'):
+        if self._troubles.get('bus') or frame.remote:
+            # What a remote frame asks for is said with the answers to a question.
             return []
         try:
             message = self._codec.from_host(frame)

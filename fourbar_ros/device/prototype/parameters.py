@@ -21,6 +21,7 @@ from typing import Any
 
 from fourbar_ros.device.prototype.messages import Codec
 from fourbar_ros.device.prototype.port import open_port, Port
+from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.parameters import Parameter
 
 CODECS = ('prototype', 'odrive')
@@ -33,7 +34,7 @@ BUS_PARAMETERS = (
               limits=(10_000, 1_000_000)),
     Parameter('bus.options', '', '', 'more for the interface, as key=value, with spaces between'),
     Parameter('codec', 'prototype', '', 'what is spoken on the bus', choices=CODECS),
-    Parameter('dbc', 'prototype', '', 'preset or path of the DBC file of codec prototype'),
+    Parameter('dbc', 'prototype', '', 'preset or path of the DBC file of what is not of ODrive'),
 )
 
 
@@ -47,14 +48,16 @@ def open_bus(values: Mapping[str, Any]) -> Port:
                      values['bus.options'])
 
 
-def make_codec(values: Mapping[str, Any]) -> Codec:
+def make_codec(values: Mapping[str, Any], mechanism: Mechanism) -> Codec:
     """
     Make the codec that parameters name.
 
+    :param mechanism: whose motors ODrives limit by their currents.
     :raises FourbarError: the DBC file is not there or refused.
     """
     if values['codec'] == 'odrive':
         from fourbar_ros.device.prototype.odrive_codec import OdriveCodec
-        return OdriveCodec(values['dbc'])
+        return OdriveCodec(
+            values['dbc'], torque_constants=mechanism.motor_torque_constants.tolist())
     from fourbar_ros.device.prototype.dbc_codec import DbcCodec
     return DbcCodec(values['dbc'])
