@@ -14,7 +14,7 @@
 
 """The prototype as a node: the topics of the plant, over a bus to four links."""
 
-from fourbar_ros.device.prototype.parameters import BUS_PARAMETERS, make_codec, open_bus
+from fourbar_ros.device.prototype.parameters import bus_parameters, make_codec, open_bus
 from fourbar_ros.device.prototype.prototype import Prototype
 from fourbar_ros.device.prototype.safety import load_safety
 from fourbar_ros.mechanism import load_mechanism
@@ -24,7 +24,7 @@ from fourbar_ros.nodes.parameters import Parameter
 from fourbar_ros.nodes.runtime import run_node
 
 OWN_PARAMETERS = (
-    *BUS_PARAMETERS,
+    *bus_parameters('socketcan', 'can0', ''),
     Parameter('safety', 'prototype', '', 'preset or path of a table of limits and reactions'),
     Parameter('answer_timeout', 0.002, 's', 'how long a tick waits for the wheels to answer',
               limits=(1e-4, 0.1)),

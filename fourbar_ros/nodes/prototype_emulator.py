@@ -14,6 +14,7 @@
 
 """The prototype without a prototype: answers on the bus as its four links would."""
 
+from dataclasses import replace
 import time
 
 from fourbar_ros.device.prototype.emulator import (
@@ -24,7 +25,7 @@ from fourbar_ros.device.prototype.emulator import (
     TroubleError,
 )
 from fourbar_ros.device.prototype.firmware import FirmwareSettings
-from fourbar_ros.device.prototype.parameters import BUS_PARAMETERS, make_codec, open_bus
+from fourbar_ros.device.prototype.parameters import bus_parameters, make_codec, open_bus
 from fourbar_ros.mechanism import LINK_NAMES
 from fourbar_ros.nodes.ground_truth import GroundTruth
 from fourbar_ros.nodes.messages import steady_ns
@@ -38,7 +39,7 @@ LETTERS = 'abcd'
 
 PARAMETERS = (
     Parameter('mechanism', 'prototype', '', 'preset or path of a mechanism file'),
-    *BUS_PARAMETERS,
+    *bus_parameters('fourbar_udp', '127.0.0.1:29537', 'peers=127.0.0.1:29536'),
     Parameter('links', LETTERS, '', 'those that are there, by their letters'),
     Parameter('rate', 1000.0, 'Hz', 'of the electronics', limits=(100.0, 2000.0)),
     Parameter('truth_rate', 250.0, 'Hz', 'of the ground truth on sim/', limits=(1.0, 1000.0)),
@@ -48,7 +49,9 @@ PARAMETERS = (
               'some seconds between them', limits=(0.0, 4000.0)),
     Parameter('clock_drift', 30e-6, 's/s', 'by how much links a and b run fast and c and d slow',
               limits=(0.0, 1e-3)),
-    *table_parameters('prototype'),
+    # The links stay where they are: nobody puts them back.
+    *(replace(row, live=False) if row.name.startswith('initial.') else row
+      for row in table_parameters('prototype')),
     *(Parameter(f'trouble.{target}', '', '', f'{" or ".join(troubles)}', live=True)
       for target, troubles in (*((name, LINK_TROUBLES) for name in LINK_NAMES),
                                ('bus', BUS_TROUBLES))),

@@ -96,6 +96,7 @@ class Emulator:
     :param rng: of what differs from start to start.
     :param now_ns: host time now, when the electronics start [ns].
     :param stamp_ns: the same in the time that stamps carry [ns].
+    :raises TroubleError: the table has no angle sensor on each link.
     :ivar samples: of the table at its last step, None before.
     :ivar counts: of frames by what became of them.
     """
@@ -103,6 +104,9 @@ class Emulator:
     def __init__(self, table: SimulatedTable, codec: Codec, links: Sequence[int],
                  firmware: FirmwareSettings, clocks: ClockSettings, rng: np.random.Generator,
                  now_ns: int, stamp_ns: int) -> None:
+        if table.sensor_names != LINK_NAMES:
+            raise TroubleError(f'links tell their own angles, but the table has the sensors '
+                               f'{", ".join(table.sensor_names)}: give one of kind absolute')
         self.samples: Samples | None = None
         self.counts: Counter[str] = Counter()
         self.table = table

@@ -26,16 +26,21 @@ from fourbar_ros.parameters import Parameter
 
 CODECS = ('prototype', 'odrive')
 
-BUS_PARAMETERS = (
-    Parameter('bus.interface', 'socketcan', '', 'interface of python-can, as socketcan, slcan, '
-              'serial, udp_multicast, virtual or fourbar_udp'),
-    Parameter('bus.channel', 'can0', '', 'channel of the interface, as can0 or HOST:PORT'),
-    Parameter('bus.bitrate', 1_000_000, 'bit/s', 'of interfaces that have one',
-              limits=(10_000, 1_000_000)),
-    Parameter('bus.options', '', '', 'more for the interface, as key=value, with spaces between'),
-    Parameter('codec', 'prototype', '', 'what is spoken on the bus', choices=CODECS),
-    Parameter('dbc', 'prototype', '', 'preset or path of the DBC file of what is not of ODrive'),
-)
+
+def bus_parameters(interface: str, channel: str, options: str) -> tuple[Parameter, ...]:
+    """List the parameters of a bus; the arguments are defaults."""
+    return (
+        Parameter('bus.interface', interface, '', 'interface of python-can, as socketcan, slcan, '
+                  'serial, udp_multicast, virtual or fourbar_udp'),
+        Parameter('bus.channel', channel, '', 'channel of the interface, as can0 or HOST:PORT'),
+        Parameter('bus.bitrate', 1_000_000, 'bit/s', 'of interfaces that have one',
+                  limits=(10_000, 1_000_000)),
+        Parameter('bus.options', options, '',
+                  'more for the interface, as key=value, with spaces between'),
+        Parameter('codec', 'prototype', '', 'what is spoken on the bus', choices=CODECS),
+        Parameter('dbc', 'prototype', '', 'preset or path of the DBC file of what is not of '
+                  'ODrive'),
+    )
 
 
 def open_bus(values: Mapping[str, Any]) -> Port:
