@@ -23,6 +23,7 @@ from typing import Any
 
 from fourbar_ros.commands.main import COMMANDS
 from fourbar_ros.configuration import config_file, load_yaml
+from fourbar_ros.device.prototype.safety import LEAST, load_safety
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism
 from fourbar_ros.nodes.tables import markdown_text, prototype_text, yaml_text
@@ -169,3 +170,22 @@ def test_mechanisms_are_told(heading: str) -> None:
     motors = {item.name for item in fields(Mechanism) if item.name.startswith('motor_')}
     assert set(told) == (motors if heading == '## Motors' else {
         item.name for item in fields(Mechanism)} - motors | {'motor_*'})
+
+
+def test_what_stops_the_prototype_is_told() -> None:
+    """Every row of the table in config, with limit, time, reaction and the least reaction."""
+    text = (ROOT / 'docs' / 'hardware.md').read_text().split('## What stops what\n', 1)[1]
+    told = {}
+    for line in re.findall(r'^\| `.*\|$', text.split('\n## ', 1)[0], re.MULTILINE):
+        row, _, limit, lasting, reaction, least = (
+            cell.strip() for cell in line.strip('|').split('|'))
+        told[row.strip('`')] = (
+            *(float(re.findall('[0-9.]+', cell)[0]) if cell else 0.0 for cell in (limit, lasting)),
+            re.split('[: ]', reaction)[0], least)
+    table = load_safety('prototype')
+    expected = {row: (rule.limit, rule.lasting, rule.reaction.name.lower(),
+                      LEAST[row].name.lower()) for row, rule in table.items()}
+    # What only keeps it from being armed has no other consequence.
+    limit, lasting, *_ = expected['wheel_speed_to_arm']
+    expected['wheel_speed_to_arm'] = (limit, lasting, 'refuses', 'refuses')
+    assert told == expected

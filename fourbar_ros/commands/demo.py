@@ -260,7 +260,7 @@ def _move(testbed: Any, processes: Processes, scenario: Scenario, progress_bar: 
     """Wait for everything, arm, move, and stop everything again."""
     # What the report needs, loaded while there is nothing to do but wait.
     import fourbar_ros.analysis.figures  # noqa: F401
-    from fourbar_ros.nodes.runtime import step_back
+    from fourbar_ros.nodes.priority import step_back
 
     def until(condition: Callable[[], bool], missing: str, seconds: float = START_UP) -> None:
         def checked() -> bool:

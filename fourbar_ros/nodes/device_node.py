@@ -16,7 +16,6 @@
 
 from fourbar_ros.device import PaceError, Testbed, TestbedSettings
 from fourbar_ros.device.gate import DeviceState
-from fourbar_ros.device.testbed import TIMEOUT_ACTIONS
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.nodes.device_topics import DeviceTopics, LEVELS
@@ -32,29 +31,10 @@ from fourbar_ros.nodes.messages import (
     WARN,
 )
 from fourbar_ros.nodes.paces import realtime_pace
-from fourbar_ros.nodes.parameters import declare, Parameter
+from fourbar_ros.nodes.parameters import declare
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
-
-
-def common_parameters(mechanism):
-    """
-    List the parameters that all devices have.
-
-    :param mechanism: default of that parameter.
-    """
-    return (
-        Parameter('mechanism', mechanism, '', 'preset or path of a mechanism file'),
-        Parameter('rate', 250.0, 'Hz', 'control rate, one tick per period',
-                  limits=(1.0, 2000.0)),
-        Parameter('command_timeout', 0.1, 's', 'longest time without a command while armed',
-                  limits=(0.002, 10.0)),
-        Parameter('sensor_timeout', 0.2, 's', 'a link without a sample for so long is silent',
-                  limits=(0.002, 10.0)),
-        Parameter('timeout_action', 'coast', '', 'what the wheels do when commands stay away',
-                  choices=TIMEOUT_ACTIONS),
-    )
 
 
 class DeviceNode(Node):

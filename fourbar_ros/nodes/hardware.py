@@ -19,6 +19,7 @@ from fourbar_ros.device.prototype.prototype import Prototype
 from fourbar_ros.device.prototype.safety import load_safety
 from fourbar_ros.mechanism import load_mechanism
 from fourbar_ros.nodes import device_node
+from fourbar_ros.nodes.device_parameters import common_parameters
 from fourbar_ros.nodes.messages import steady_ns
 from fourbar_ros.nodes.parameters import Parameter
 from fourbar_ros.nodes.runtime import run_node
@@ -30,7 +31,7 @@ OWN_PARAMETERS = (
               limits=(1e-4, 0.1)),
     Parameter('gyro', False, '', 'whether the links have gyros'),
 )
-PARAMETERS = device_node.common_parameters('prototype') + OWN_PARAMETERS
+PARAMETERS = common_parameters('prototype') + OWN_PARAMETERS
 
 
 class HardwareNode(device_node.DeviceNode):

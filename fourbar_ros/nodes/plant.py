@@ -16,6 +16,7 @@
 
 from fourbar_ros.device import Remedy
 from fourbar_ros.nodes import device_node
+from fourbar_ros.nodes.device_parameters import common_parameters
 from fourbar_ros.nodes.ground_truth import GroundTruth
 from fourbar_ros.nodes.messages import steady_ns
 from fourbar_ros.nodes.paces import fast_pace, lockstep_pace, realtime_pace
@@ -35,7 +36,7 @@ CLOCKS = {'realtime': realtime_pace, 'fast': fast_pace, 'lockstep': lockstep_pac
 
 _TABLE = table_parameters('ideal')
 PARAMETERS = (
-    *device_node.common_parameters('paper'),
+    *common_parameters('paper'),
     _TABLE[0],
     Parameter('clock', 'realtime', '', 'what the ticks follow', choices=tuple(CLOCKS)),
     Parameter('real_time_factor', 1.0, '', 'simulated seconds per second of the fast clock, 0 '

@@ -15,14 +15,13 @@
 """How every node starts, runs and ends."""
 
 import argparse
-from contextlib import suppress
 import gc
-import os
 import signal
 import time
 
 from fourbar_ros.mechanism.compiled import announced
 from fourbar_ros.nodes.environment import RosError
+from fourbar_ros.nodes.priority import go_first
 import rclpy
 from rclpy.duration import Duration
 from rclpy.exceptions import (
@@ -147,24 +146,6 @@ def run_node(make_node, name, description, argv):
             _deliver(node)
         runtime.shut_down(node)
     return 0
-
-
-def go_first():
-    """
-    Give this process real-time priority, where the user may (limit `rtprio`).
-
-    All its threads, since the middleware has its own; the lowest priority is above all that is
-    not real-time. Without the permission everything stays as it is.
-    """
-    with suppress(PermissionError):
-        for thread in os.listdir('/proc/self/task'):
-            os.sched_setscheduler(
-                int(thread), os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
-
-
-def step_back():
-    """Let those who work go first: for processes that only watch, on a machine with few cores."""
-    os.nice(5)
 
 
 def _deliver(node):

@@ -14,7 +14,7 @@
 
 """A bag comes back as it was written, or with one line that says why not."""
 
-from fourbar_ros.analysis.bags import BagError, read_bag
+from fourbar_ros.analysis.bags import BagError, JointSeries, read_bag
 from fourbar_ros.errors import FourbarError
 import numpy as np
 import pytest
@@ -160,3 +160,16 @@ def test_broken_metadata_is_one_line(synthetic, tmp_path, text):
     bag = synthetic.write_bag(tmp_path / 'bag', {'/timing': []})
     (bag / 'metadata.yaml').write_text(text)
     complaint_about(bag)
+
+
+def test_what_lies_between_messages_is_on_a_straight_line_also_through_a_turn():
+    stamps = np.array([0, 4, 8, 12, 40, 44]) * 1_000_000 + 1_700_000_000_000_000_000
+    angles = np.array([3.1, 3.14, -3.1032, -3.0632, 0.0, 0.1])[:, None]
+    series = JointSeries('/a', stamps, stamps, ('link_a',), angles, angles, angles)
+    wanted = stamps[0] + np.array([-1, 0, 1, 6, 20, 42, 44, 45]) * 1_000_000
+    found = series.at(wanted)
+    # Before, after, at the first message, and in a gap there is nothing.
+    assert (found.stamp_ns - stamps[0]).tolist() == [1_000_000, 6_000_000, 42_000_000, 44_000_000]
+    assert found.position[:2, 0] == pytest.approx([3.11, 3.16], abs=1e-4)
+    assert np.remainder(found.position[2:, 0], 2 * np.pi) == pytest.approx([0.05, 0.1])
+    assert found.velocity[1, 0] == pytest.approx(0.0184, abs=1e-9)
