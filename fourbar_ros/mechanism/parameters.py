@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, MISSING, replace
 from functools import cached_property
 from typing import Any
 
@@ -48,8 +48,8 @@ ROUNDING = 1e-15
 
 
 # Least values of those that need not be positive.
-LOWEST = {'com_positions': -np.inf, 'joint_damping': 0.0, 'motor_time_constants': 0.0,
-          'motor_resistances': 0.0, 'link_angle_offsets': -np.inf}
+LOWEST = {'com_positions': -np.inf, 'link_angle_offsets': -np.inf, 'joint_damping': 0.0,
+          'motor_time_constants': 0.0, 'motor_resistances': 0.0}
 
 
 class MechanismError(FourbarError):
@@ -82,8 +82,9 @@ class Mechanism:
     :param joint_stiffness: (4,) how hard the two ends in joints 1 to 4 are pulled together [N/m],
         default infinite: rigid. Either all four joints are rigid or none.
     :param joint_damping: (4,) of the same, for joints that are not rigid [N s/m], default 0.
-    :param link_angle_offsets: (4,) that the sensors of the links read beyond the true angle [rad],
-        default 0.
+    :param link_angle_offsets: (4,) what the sensors of the links read beyond the orientation of
+        their links [rad], default 0. A real device takes it out of `link_angles`; a simulated one
+        has nothing to take out.
     :raises MechanismError: wrong shape, not finite, not positive, lengths that cannot close, or
         joints of which only some are rigid.
     """
@@ -181,8 +182,7 @@ class Mechanism:
         :raises MechanismError: a key is missing or unknown, or a value is refused.
         """
         names = {item.name for item in fields(cls)}
-        optional = {name for name in names if name.startswith(('motor_', 'joint_'))}
-        optional.add('link_angle_offsets')
+        optional = {item.name for item in fields(cls) if item.default_factory is not MISSING}
         check_keys(values, names - optional, origin, MechanismError, optional=optional)
         try:
             return cls(**values)

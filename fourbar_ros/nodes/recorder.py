@@ -24,7 +24,8 @@ import importlib
 import time
 
 from fourbar_ros.errors import FourbarError
-from fourbar_ros.nodes.runtime import Runtime, SPIN_TIMEOUT, step_back
+from fourbar_ros.nodes.priority import step_back
+from fourbar_ros.nodes.runtime import Runtime, SPIN_TIMEOUT
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node

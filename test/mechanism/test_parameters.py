@@ -116,6 +116,21 @@ def test_mass_centre_may_lie_anywhere() -> None:
     np.testing.assert_array_equal(mechanism.com_positions, centres)
 
 
+def test_sensors_have_no_offset_by_default() -> None:
+    values = {name: described()[name] for name in REQUIRED}
+    np.testing.assert_array_equal(Mechanism(**values).link_angle_offsets, np.zeros(4))
+
+
+def test_offset_of_a_sensor_may_be_negative_but_must_be_known() -> None:
+    offsets = [0.01, -0.02, 0.0, 3.0]
+    values = described(link_angle_offsets=offsets)
+    np.testing.assert_array_equal(
+        Mechanism.from_mapping(values, 'file').link_angle_offsets, offsets)
+    for value in (np.nan, np.inf, -np.inf):
+        with pytest.raises(MechanismError, match='link_angle_offsets of link_b must be finite'):
+            Mechanism(**described(link_angle_offsets=[0.0, value, 0.0, 0.0]))
+
+
 @pytest.mark.parametrize('link', range(4))
 @pytest.mark.parametrize('excess', [0.0, 0.05])
 def test_lengths_that_cannot_close_are_refused(link: int, excess: float) -> None:

@@ -1,0 +1,135 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Zeros of the link encoders: found within their intervals, refused where links do not rest."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import radians
+from typing import Any
+
+from fourbar_ros.analysis.calibration.encoders import encoder_offsets, jig_pose, mean_readings
+from fourbar_ros.analysis.calibration.quantity import CalibrationError, WIDTH_95
+from fourbar_ros.analysis.calibration.signals import link_signal, LinkSignal
+from fourbar_ros.mechanism import assemble, Mechanism
+from fourbar_ros.plant import InitialState, Table
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+COUNT = 500
+NOISE = 1.7e-3
+BIASES = np.array([0.02, -0.03, 0.001, 0.05])
+
+
+def readings(pose: Any, seed: int, drift: float = 0.0, noise: float = NOISE) -> LinkSignal:
+    """Read a pose with biases, noise and 1 % of dropout; all links drift [rad]."""
+    generator = np.random.default_rng(seed)
+    angles = (np.asarray(pose) + BIASES + noise * generator.standard_normal((COUNT, 4))
+              + drift * np.linspace(0.0, 1.0, COUNT)[:, None])
+    angles[generator.random(angles.shape) < 0.01] = np.nan
+    wrapped = np.pi - (np.pi - angles) % (2.0 * np.pi)
+    return link_signal(np.arange(COUNT) * 4_000_000, wrapped, 0)
+
+
+@pytest.mark.parametrize('phi_a', [0.0, 3.13, -3.13])
+def test_offsets_are_found_wherever_the_circle_is_cut(prototype: Mechanism, phi_a: float) -> None:
+    pose = assemble(prototype, phi_a, phi_a + 1.0)
+    found = encoder_offsets(readings(pose, seed=3), pose)
+    # Five standard errors: once in two million.
+    np.testing.assert_array_less(np.abs(found.offsets - BIASES), 5.0 * found.standard_errors)
+    np.testing.assert_allclose(found.standard_errors, NOISE / np.sqrt(COUNT), rtol=0.5)
+
+
+def test_intervals_cover_the_truth_as_often_as_they_say(prototype: Mechanism) -> None:
+    """Of 200 intervals at 95 % fewer than the bound cover it once in ten thousand."""
+    pose = assemble(prototype, 0.2, 1.2)
+    covered = 0
+    for seed in range(50):
+        found = encoder_offsets(readings(pose, seed), pose)
+        covered += int((np.abs(found.offsets - BIASES)
+                        < WIDTH_95 * found.standard_errors).sum())
+    assert binom.ppf(1e-4, 200, 0.95) <= covered <= binom.ppf(1.0 - 1e-4, 200, 0.95), 'seeds 0-49'
+
+
+def test_bias_of_the_simulated_sensors_is_found(
+        prototype: Mechanism, lab: Table, make_bed: Callable[..., Any]) -> None:
+    """The table of the prototype, whose friction keeps its links at rest; seed 1."""
+    biased = replace(lab, link_sensors=replace(lab.link_sensors, bias=tuple(BIASES)))
+    bed = make_bed(prototype, biased, 1, InitialState())
+    for _ in range(COUNT):
+        bed.tick()
+    links, _ = bed.recorded()
+    pose = jig_pose(prototype, {'link_a': 0.0, 'link_b': np.pi / 3}, mean_readings(links))
+    found = encoder_offsets(links, pose)
+    # Beside the noise the steps of 14 bits, which it smooths but for a thousandth.
+    np.testing.assert_allclose(found.offsets, BIASES, atol=5.0 * NOISE / np.sqrt(0.98 * COUNT))
+
+
+def test_link_that_drifts_is_refused(prototype: Mechanism) -> None:
+    pose = assemble(prototype, 0.0, 1.0)
+    with pytest.raises(CalibrationError, match='link_a does not rest: it drifts by 0.0'):
+        encoder_offsets(readings(pose, seed=0, drift=0.01), pose)
+
+
+def test_link_that_shakes_is_refused(prototype: Mechanism) -> None:
+    pose = assemble(prototype, 0.0, 1.0)
+    with pytest.raises(CalibrationError, match='spread by 0.0.* rad rms, limit 0.01 rad'):
+        encoder_offsets(readings(pose, seed=0, noise=0.02), pose)
+
+
+def test_few_samples_are_refused(prototype: Mechanism) -> None:
+    signal = readings(assemble(prototype, 0.0, 1.0), seed=0)
+    with pytest.raises(CalibrationError, match='gave .* samples, and 20 are needed'):
+        encoder_offsets(LinkSignal(signal.times[:10], signal.angles[:10]), np.zeros(4))
+
+
+@pytest.mark.parametrize('branch', ['open', 'crossed'])
+def test_two_links_and_the_readings_give_the_pose(irregular: Mechanism, branch: str) -> None:
+    pose = assemble(irregular, 0.3, 1.4, branch)
+    known = {'link_a': 0.3, 'link_b': 1.4}
+    np.testing.assert_allclose(np.cos(jig_pose(irregular, known, pose + BIASES) - pose), 1.0)
+
+
+def test_third_link_decides_the_branch_against_bad_readings(irregular: Mechanism) -> None:
+    pose = assemble(irregular, 0.3, 1.4, 'crossed')
+    known = {'link_a': 0.3, 'link_b': 1.4, 'link_d': float(pose[3])}
+    found = jig_pose(irregular, known, assemble(irregular, 0.3, 1.4, 'open'))
+    np.testing.assert_allclose(np.cos(found - pose), 1.0)
+
+
+@pytest.mark.parametrize(('known', 'complaint'), [
+    ({'link_a': 0.0, 'link_b': 1.0, 'link_c': 0.5, 'link_d': 1.0}, 'gap 0.1.* m, limit 0.0006 m'),
+    ({'link_a': 0.0, 'link_b': 1.0, 'link_c': radians(20.0)}, 'does not close the loop within'),
+    ({'link_a': 0.0, 'link_e': 1.0}, "unknown link 'link_e'"),
+    ({'link_a': 0.0}, 'names 1 of the links, and two are needed'),
+    ({'link_a': 0.0, 'link_b': 0.0}, 'do not determine'),
+])
+def test_pose_that_cannot_be_is_refused(
+        prototype: Mechanism, known: dict[str, float], complaint: str) -> None:
+    with pytest.raises(CalibrationError, match=complaint):
+        jig_pose(prototype, known, np.array([0.0, 1.0, 0.0, 1.0]))
+
+
+def test_pose_beyond_reach_is_refused(irregular: Mechanism) -> None:
+    with pytest.raises(CalibrationError, match='the loop cannot close'):
+        jig_pose(irregular, {'link_a': 0.0, 'link_c': np.pi - 0.05}, np.zeros(4))
+
+
+def test_perfect_sensors_have_no_error(prototype: Mechanism) -> None:
+    pose = assemble(prototype, 0.1, 1.1)
+    signal = link_signal(np.arange(100) * 4_000_000, np.tile(pose, (100, 1)), 0)
+    found = encoder_offsets(signal, pose)
+    np.testing.assert_allclose(found.offsets, 0.0, atol=1e-15)
+    np.testing.assert_allclose(found.standard_errors, 0.0, atol=1e-15)

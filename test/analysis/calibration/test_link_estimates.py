@@ -1,0 +1,163 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Links: what a motion depends on is found to 1 % and within its intervals, the rest stays."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from fourbar_ros.analysis.calibration.excitation import MultiSine
+from fourbar_ros.analysis.calibration.link_model import parameters_of
+from fourbar_ros.analysis.calibration.links import link_estimate, LinkEstimate
+from fourbar_ros.analysis.calibration.quantity import CalibrationError, WIDTH_95
+from fourbar_ros.analysis.calibration.signals import LinkSignal, WheelSignal
+from fourbar_ros.mechanism import Mechanism, reduced_form
+from fourbar_ros.plant import InitialState, Table
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+from scipy.stats import binom
+
+SEEDS = range(8)
+START = {'prototype': InitialState(), 'irregular': InitialState(link_b=1.3)}
+
+
+def believed(truth: Mechanism, seed: int) -> Mechanism:
+    """Return a mechanism file that is off by 5 % in inertias and by 5 mm in mass centres."""
+    generator = np.random.default_rng(100 + seed)
+    return replace(
+        truth, link_inertias=truth.link_inertias * (1.0 + 0.05 * generator.standard_normal(4)),
+        com_positions=truth.com_positions + 5e-3 * generator.standard_normal((4, 2)))
+
+
+def reduced(mechanism: Mechanism, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return A_aa, A_ab, A_bb at poses, one after the other [kg m^2]."""
+    return np.concatenate([
+        reduced_form(mechanism, pose, np.zeros(4)).mass_matrix[[0, 0, 1], [0, 1, 1]]
+        for pose in poses])
+
+
+@pytest.fixture(scope='module')
+def estimates(prototype: Mechanism, irregular: Mechanism, lab: Table, excited: Callable[..., Any]
+              ) -> dict[str, list[tuple[Mechanism, LinkEstimate]]]:
+    """Estimate both linkages on the table of the prototype, seeds 0 to 7."""
+    found: dict[str, list[tuple[Mechanism, LinkEstimate]]] = {}
+    for name, truth in (('prototype', prototype), ('irregular', irregular)):
+        found[name] = []
+        for seed in SEEDS:
+            links, wheels = excited(truth, lab, MultiSine(truth, 24.0, 0.02), seed, START[name])
+            found[name].append((truth, link_estimate(believed(truth, seed), links, wheels)))
+    return found
+
+
+@pytest.mark.parametrize('name', START)
+def test_reduced_inertias_are_found_to_one_percent(
+        estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]], name: str) -> None:
+    """Of the size of the diagonal; the file beforehand is farther off."""
+    for seed, (truth, found) in enumerate(estimates[name]):
+        wanted = reduced(truth, found.poses)
+        size = np.sqrt(wanted[0] * wanted[2])
+        values = np.array([item.value for item in found.reduced_inertias()])
+        assert np.abs(values - wanted).max() < 0.01 * size, f'seed {seed}'
+        before = np.array([item.before for item in found.reduced_inertias()], dtype=float)
+        assert np.abs(values - wanted).max() < 0.3 * np.abs(before - wanted).max(), f'seed {seed}'
+
+
+@pytest.mark.parametrize('name', START)
+def test_intervals_cover_the_truth(
+        estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]], name: str) -> None:
+    """
+    A_aa, A_ab and A_bb at a middle pose: of 24 intervals at 95 %, seeds 0 to 7.
+
+    Fewer than the bound cover the truth once in a thousand, were they independent.
+    """
+    covered = 0
+    for truth, found in estimates[name]:
+        wanted = reduced(truth, found.poses)[3:6]
+        for item, value in zip(found.reduced_inertias()[3:6], wanted):
+            covered += abs(item.value - value) < WIDTH_95 * item.standard_error
+    assert covered >= binom.ppf(1e-3, 3 * len(SEEDS), 0.95), 'seeds 0-7'
+
+
+def test_rhombus_tells_four_combinations_and_another_linkage_more(
+        estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]]) -> None:
+    """
+    A rhombus has A_aa, A_bb, and A_ab with a cosine and a sine: no motion tells more.
+
+    The order of magnitude between the fourth and the fifth says that this is no matter of noise.
+    """
+    for seed, (_, found) in enumerate(estimates['prototype']):
+        assert [one.determined for one in found.combinations] == [True] * 4 + [False] * 8, seed
+        assert found.combinations[4].error > 10.0 * found.combinations[3].error, seed
+    for seed, (_, found) in enumerate(estimates['irregular']):
+        assert sum(one.determined for one in found.combinations) > 4, seed
+
+
+def test_sums_over_opposite_links_are_told_and_differences_are_not(
+        estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]]) -> None:
+    """
+    In a rhombus I_a - I_c has no effect; what has none does not move.
+
+    Of all files that fit as well the nearest is taken, so the truth is farther away.
+    """
+    for seed, (truth, found) in enumerate(estimates['prototype']):
+        weights = np.array([one.weights for one in found.combinations if one.determined])
+        moved = (parameters_of(found.mechanism) - parameters_of(found.before)) / found.sizes
+        away = (parameters_of(truth) - parameters_of(found.before)) / found.sizes
+        for first, second in ((0, 2), (1, 3)):
+            apart = np.zeros(12)
+            apart[[first, second]] = np.array([1.0, -1.0]) / np.sqrt(2.0)
+            # Sizes are shares of what is believed of each, and that differs by 5 %.
+            assert np.linalg.norm(weights @ apart) < 0.1, f'seed {seed}'
+            assert abs(moved @ apart) < 0.1 * np.linalg.norm(moved), f'seed {seed}'
+        assert np.linalg.norm(moved) < np.linalg.norm(away), f'seed {seed}'
+
+
+def test_noise_of_the_sensors_is_what_is_left(
+        estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]], lab: Table) -> None:
+    """Noise and the rounding to 14 bits; 20000 samples know it to half a percent."""
+    expected = np.hypot(lab.link_sensors.noise_rms,
+                        2.0 * np.pi / lab.link_sensors.counts_per_turn / np.sqrt(12.0))
+    for pairs in estimates.values():
+        for seed, (_, found) in enumerate(pairs):
+            assert found.noise == pytest.approx(expected, rel=0.03), f'seed {seed}'
+
+
+def still(seconds: float) -> tuple[LinkSignal, WheelSignal]:
+    """Record links and wheels that rest."""
+    times = np.arange(0.0, seconds, 4e-3)
+    angles = np.tile([0.0, 1.0, 0.0, 1.0], (len(times), 1))
+    zeros = np.zeros((len(times), 4))
+    return LinkSignal(times, angles), WheelSignal(times, zeros, zeros, zeros)
+
+
+def test_links_that_rest_tell_nothing(prototype: Mechanism) -> None:
+    with pytest.raises(CalibrationError, match='the links move for 0.0 s, and 8 s are needed'):
+        link_estimate(prototype, *still(20.0))
+
+
+def test_silent_link_is_named(prototype: Mechanism) -> None:
+    links, wheels = still(20.0)
+    links.angles[1000:1250, 2] = np.nan
+    with pytest.raises(CalibrationError, match='link_c was silent for 1.00 s, limit 0.4 s'):
+        link_estimate(prototype, links, wheels)
+
+
+def test_missing_ticks_are_told(prototype: Mechanism) -> None:
+    links, wheels = still(20.0)
+    kept = np.delete(np.arange(len(wheels.times)), 700)
+    with pytest.raises(CalibrationError, match='1 ticks of flywheel_states are missing'):
+        link_estimate(prototype, links, WheelSignal(
+            wheels.times[kept], wheels.angles[kept], wheels.speeds[kept], wheels.efforts[kept]))

@@ -1,0 +1,115 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Wheels: found to 1 % and within their intervals, whatever the links do."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from fourbar_ros.analysis.calibration.excitation import SpinAndCoast
+from fourbar_ros.analysis.calibration.quantity import CalibrationError, WIDTH_95
+from fourbar_ros.analysis.calibration.signals import WheelSignal
+from fourbar_ros.analysis.calibration.wheels import (
+    friction_of_all,
+    wheel_estimate,
+    wheels_moved,
+)
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.plant import Table
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+SEEDS = range(20)
+COULOMB, VISCOUS = 1e-3, 2e-6
+TOP, TORQUE, COAST = 80.0, 0.02, 6.0
+
+
+def test_truth_is_found_to_one_percent_and_covered(
+        prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
+    """
+    On the table of the prototype, links free: seeds 0 to 19, each wheel five times.
+
+    Of 60 intervals at 95 % fewer than the bound cover the truth once in a thousand.
+    """
+    uneven = replace(prototype, flywheel_inertias=np.array([1.2e-4, 1.3e-4, 1.1e-4, 1.25e-4]))
+    covered = 0
+    for seed in SEEDS:
+        wheel = seed % 4
+        links, wheels = excited(
+            uneven, lab, SpinAndCoast(uneven, [wheel], TOP, TORQUE, COAST), seed)
+        found = wheel_estimate(wheel, links, wheels)
+        truth = np.array([uneven.flywheel_inertias[wheel], COULOMB, VISCOUS])
+        errors = np.array([found.inertia, found.coulomb, found.viscous]) - truth
+        assert np.abs(errors / truth).max() < 0.01, f'seed {seed}'
+        covered += int((np.abs(errors)
+                        < WIDTH_95 * np.sqrt(np.diag(found.covariance))).sum())
+    assert covered >= binom.ppf(1e-3, 3 * len(SEEDS), 0.95), 'seeds 0-19'
+
+
+def test_all_wheels_one_after_the_other(
+        prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
+    """Seed 7; the friction for the controller is the mean."""
+    links, wheels = excited(
+        prototype, lab, SpinAndCoast(prototype, range(4), TOP, TORQUE, COAST), 7)
+    assert wheels_moved(wheels) == [0, 1, 2, 3]
+    estimates = [wheel_estimate(wheel, links, wheels) for wheel in range(4)]
+    coulomb, viscous = friction_of_all(estimates)
+    assert coulomb.value == pytest.approx(COULOMB, rel=0.01)
+    assert abs(viscous.value - VISCOUS) < 4.0 * viscous.standard_error
+    assert coulomb.standard_error < min(
+        float(np.sqrt(one.covariance[1, 1])) for one in estimates)
+
+
+def test_recoil_of_the_links_counts(
+        prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
+    """Without it the inertia would be off by that of the wheel over that of a pair, 0.3 %."""
+    links, wheels = excited(
+        prototype, lab, SpinAndCoast(prototype, [0], TOP, TORQUE, COAST), 0)
+    held = replace(links, angles=np.zeros_like(links.angles))
+    right = wheel_estimate(0, links, wheels).inertia
+    wrong = wheel_estimate(0, held, wheels).inertia
+    assert wrong / right - 1.0 == pytest.approx(-1.2e-4 / 0.039, rel=0.3)
+
+
+def test_model_that_misses_something_widens_the_intervals(
+        prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
+    """A wobble of the readings that lasts for many samples is no white noise; seed 2."""
+    links, wheels = excited(
+        prototype, lab, SpinAndCoast(prototype, [0], TOP, TORQUE, COAST), 2)
+    wobbling = replace(
+        links, angles=links.angles + 5e-3 * np.sin(8.0 * links.times)[:, None])
+    honest, doubtful = (wheel_estimate(0, signal, wheels) for signal in (links, wobbling))
+    # The rms of the residuals grows by two; what stays for a quarter of a second by far more.
+    assert doubtful.covariance[0, 0] > 20.0 * honest.covariance[0, 0]
+
+
+def cut(wheels: WheelSignal, keep: Any) -> WheelSignal:
+    """Return the ticks that an index picks."""
+    return WheelSignal(wheels.times[keep], wheels.angles[keep], wheels.speeds[keep],
+                       wheels.efforts[keep])
+
+
+def test_what_is_not_on_record_is_named(
+        prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
+    links, wheels = excited(
+        prototype, lab, SpinAndCoast(prototype, [1], TOP, TORQUE, 3.0), 0)
+    with pytest.raises(CalibrationError, match='no spin-up of flywheel_a'):
+        wheel_estimate(0, links, wheels)
+    driven = np.abs(wheels.efforts[:, 1]) > 0.5 * TORQUE
+    with pytest.raises(CalibrationError, match='no coast-down of flywheel_b'):
+        wheel_estimate(1, links, cut(wheels, driven))
+    with pytest.raises(CalibrationError, match='no spin-up of flywheel_b'):
+        wheel_estimate(1, links, cut(wheels, ~driven))
