@@ -26,6 +26,7 @@ from fourbar_ros.device.prototype.emulator import (
 )
 from fourbar_ros.device.prototype.firmware import FirmwareSettings
 from fourbar_ros.device.prototype.parameters import bus_parameters, make_codec, open_bus
+from fourbar_ros.device.prototype.serving import attend
 from fourbar_ros.mechanism import LINK_NAMES
 from fourbar_ros.nodes.ground_truth import GroundTruth
 from fourbar_ros.nodes.messages import steady_ns
@@ -100,14 +101,7 @@ class EmulatorNode(Node):
     def work(self):
         """Wait for the next frame or step, and do what it takes; then let ROS have its turn."""
         emulator = self._emulator
-        timeout_s = (emulator.next_ns - steady_ns()) * 1e-9
-        received = self._bus.receive(max(timeout_s, 0.0))
-        while received is not None:
-            self._send(emulator.take(received[0], steady_ns()))
-            received = self._bus.receive(0.0) if steady_ns() < emulator.next_ns else None
-        now_ns = steady_ns()
-        if now_ns >= emulator.next_ns:
-            self._send(emulator.advance(now_ns))
+        now_ns = attend(emulator, self._bus, steady_ns)
         if now_ns - self._truth_ns >= self._truth_period_ns and emulator.samples is not None:
             self._truth_ns += max(
                 1, (now_ns - self._truth_ns) // self._truth_period_ns) * self._truth_period_ns
@@ -115,10 +109,6 @@ class EmulatorNode(Node):
         if now_ns - self._spin_ns >= SPIN_NS:
             self._spin_ns = now_ns
             self._runtime.executor.spin_once(timeout_sec=0.0)
-
-    def _send(self, frames):
-        for frame in frames:
-            self._bus.send(frame)
 
     def _changed(self, values):
         self._trouble(self._values, values)

@@ -36,6 +36,7 @@ STUDIES = {
     'validation': 'section 3: our motions beside other engines and reference motions',
     'consistency': 'the estimator in closed loops at random: NEES, NIS, errors beside their bound',
     'crossing': 'change points with four wheels and with two: crossing, parking, turning there',
+    'bus': 'ten minutes of the prototype on a bus over loopback: lost frames, round trips',
 }
 RANDOM = {'consistency': 100, 'crossing': 300}
 """Those that draw at random, and how many runs of each kind unless told."""
@@ -112,5 +113,9 @@ def load_study(name: str, **sample: int) -> Callable[[Progress], Result]:
         raise StudyError(f'study {name} draws nothing at random: it takes no '
                          + ', '.join(f'--{option}' for option in sample))
     drawn = {'sample': Sample(**{'runs': RANDOM[name], **sample})} if name in RANDOM else {}
-    run: Callable[..., Result] = import_module(f'{__name__}.{name}').run
+    try:
+        run: Callable[..., Result] = import_module(f'{__name__}.{name}').run
+    except ImportError as error:
+        raise StudyError(
+            f'{error.name} is missing: pip install fourbar_ros[analysis,hardware]') from None
     return partial(run, **drawn)

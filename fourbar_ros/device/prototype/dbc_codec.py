@@ -203,13 +203,16 @@ class _Motor(Word):
         self._torque = layout.number('TORQUE')
         self._answers, self._state = layout.count('ANSWERS', 256), layout.count('STATE', 5)
         self._answered = layout.count('ANSWERED', 2)
+        self._counter = layout.count('COUNTER', 256)
 
     def write(self, message: MotorReport) -> Mapping[str, float]:
         if message.state is None:
             raise FrameError('value', f'{self.layout.name}: STATE must be told')
+        if message.counter is None:
+            raise FrameError('value', f'{self.layout.name}: COUNTER must be told')
         answered = message.answers is not None
         return {'TORQUE': self._torque.write(message.torque), 'STATE': message.state.value,
-                'ANSWERED': int(answered),
+                'ANSWERED': int(answered), 'COUNTER': self._counter.write(message.counter),
                 'ANSWERS': self._answers.write(message.answers if answered else 0)}
 
     def read(self, counts: Mapping[str, Any]) -> MotorReport:
@@ -217,7 +220,7 @@ class _Motor(Word):
         return MotorReport(
             self.link, self._torque.read(counts['TORQUE']),
             answers if self._answered.read(counts['ANSWERED']) else None,
-            _STATES[self._state.read(counts['STATE'])])
+            _STATES[self._state.read(counts['STATE'])], self._counter.read(counts['COUNTER']))
 
 
 class _Angle(Word):

@@ -249,7 +249,8 @@ class Emulator:
             return
         torque = float(self._torques[link]) / max(self._steps, 1)
         measured_us = self._link_us(link, samples.stamp_ns - self._shift_ns)
-        self._say(MotorReport(link, torque, firmware.sequence, firmware.state), frames)
+        self._say(MotorReport(
+            link, torque, firmware.sequence, firmware.state, counter), frames)
         self._say(WheelReport(
             link, counter, float(samples.wheels.angles[link]) % TURN, TURN,
             measured_us % WRAP_US, WRAP_US, float(samples.wheels.speeds[link])), frames)

@@ -98,9 +98,7 @@ class HeardLink:
 
         :param counter, sent_ns: of the last `Sync`.
         """
-        if report.counter is not None and report.counter != counter:
-            behind = (counter - report.counter) % COUNTERS
-            self.counts['late' if behind < COUNTERS // 2 else 'replayed'] += 1
+        if not self._in_time(report.counter, counter):
             return
         if self._answered is not None:
             self.counts['replayed'] += 1
@@ -130,8 +128,14 @@ class HeardLink:
         self.wheel_angle, self.wheel_ns = angle, measured_ns
         self.answer_ns, self._answered = arrival_ns, counter
 
-    def take_motor(self, report: MotorReport) -> None:
-        """Take what the motor did."""
+    def take_motor(self, report: MotorReport, counter: int) -> None:
+        """
+        Take what the motor did.
+
+        :param counter: of the last `Sync`.
+        """
+        if not self._in_time(report.counter, counter):
+            return
         if self._motor_answered:
             self.counts['replayed'] += 1
             return
@@ -194,6 +198,14 @@ class HeardLink:
         """Return the angle of the wheel at a host time near its last answer [rad]."""
         assert self.wheel_ns is not None
         return self.wheel_angle + self.wheel_speed * (stamp_ns - self.wheel_ns) * 1e-9
+
+    def _in_time(self, answered: int | None, counter: int) -> bool:
+        """Tell whether an answer is one to the last question, and count it if not."""
+        if answered is None or answered == counter:
+            return True
+        behind = (counter - answered) % COUNTERS
+        self.counts['late' if behind < COUNTERS // 2 else 'replayed'] += 1
+        return False
 
     def _measured_ns(self, time_us: int | None, wrap_us: int, arrival_ns: int) -> int | None:
         if time_us is None or not self._has_clock or not self.clock.settled:

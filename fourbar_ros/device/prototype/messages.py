@@ -157,12 +157,14 @@ class MotorReport:
     :param answers: sequence of the last command that was obeyed; None from electronics that do not
         know it.
     :param state: of the link; None where only the heartbeat tells.
+    :param counter: of the `Sync`; None from electronics that do not know it.
     """
 
     link: int
     torque: float
     answers: int | None
     state: LinkState | None
+    counter: int | None = None
 
 
 @dataclass(frozen=True)

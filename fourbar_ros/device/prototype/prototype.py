@@ -316,7 +316,7 @@ class Prototype(Device):
         if isinstance(report, WheelReport):
             link.take_wheel(report, self._counter, self._sent_ns[self._counter], arrival_ns)
         elif isinstance(report, MotorReport):
-            link.take_motor(report)
+            link.take_motor(report, self._counter)
         elif isinstance(report, AngleReport):
             link.take_angle(report, arrival_ns)
         elif isinstance(report, ClockReport):

@@ -56,7 +56,7 @@ times = st.integers(0, WRAP_US - 1)
 COMMAND = Command(1, 0.01, True, True, 7)
 LIMITS = Limits(2, 0.05, 300.0)
 WHEEL = WheelReport(3, 5, 1.25, TURN, 1000, WRAP_US)
-MOTOR = MotorReport(0, 0.02, 8, LinkState.ARMED)
+MOTOR = MotorReport(0, 0.02, 8, LinkState.ARMED, 77)
 ANGLE = AngleReport(0, 3, -1.0, 0.5, 50, WRAP_US)
 CLOCK = ClockReport(1, 3, 4_000_000_000, 2)
 HEARTBEAT = Heartbeat(2, 3, LinkState.FAULT, frozenset({'driver', 'no_limits'}), 12.0, 25.0, 1)
@@ -119,7 +119,7 @@ def test_wheel(link, counter, angle, time_us):
 
 @given(links, torques, st.none() | bytes_, st.sampled_from(LinkState))
 def test_motor(link, torque, answers, state):
-    report = MotorReport(link, torque, answers, state)
+    report = MotorReport(link, torque, answers, state, 200 + link)
     back = read(written(report))
     assert back.torque == pytest.approx(torque, rel=SINGLE, abs=1e-45)
     assert replace(back, torque=torque) == report
@@ -286,7 +286,7 @@ def test_identifiers_places_and_scales_are_those_of_the_file(changed):
 
 def test_signals_of_the_lab_are_no_trouble(changed):
     codec = changed(
-        (r'^( SG_ ANSWERED : .*)$', r'\1\n SG_ CURRENT : 48|8@1+ (1,0) [0|0] "A" HOST'))
+        (r'^( SG_ ANSWERED : .*)$', r'\1\n SG_ CURRENT : 45|3@1+ (1,0) [0|0] "A" HOST'))
     assert codec.from_links(*codec.to_host(MOTOR)).state is MOTOR.state
 
 

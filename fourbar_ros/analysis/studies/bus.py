@@ -1,0 +1,197 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Ten minutes of commands and samples between the host and emulated links, over UDP on loopback.
+
+Two processes, no ROS: what is timed is the bus, its language, and what both ends make of it.
+"""
+
+from __future__ import annotations
+
+import io
+from multiprocessing import get_context
+from multiprocessing.synchronize import Event
+import time
+from typing import Any
+
+from fourbar_ros.analysis import style
+from fourbar_ros.analysis.checks import at_least, at_most
+from fourbar_ros.analysis.progress import Progress
+from fourbar_ros.analysis.studies import Result, StudyError
+from fourbar_ros.analysis.style import COLOURS
+from fourbar_ros.device import Device, DeviceState, Drive, SimulatedTable
+from fourbar_ros.device.prototype.dbc_codec import DbcCodec
+from fourbar_ros.device.prototype.emulator import ClockSettings, Emulator
+from fourbar_ros.device.prototype.firmware import FirmwareSettings
+from fourbar_ros.device.prototype.port import Port
+from fourbar_ros.device.prototype.prototype import Prototype
+from fourbar_ros.device.prototype.safety import load_safety
+from fourbar_ros.device.prototype.serving import attend
+from fourbar_ros.device.prototype.udp_bus import UdpBus
+from fourbar_ros.mechanism import load_mechanism
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.plant import InitialState, load_table, Plant
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+import numpy as np
+
+SECONDS = 600
+PERIOD_NS, ANSWER_TIMEOUT_S = 4_000_000, 2e-3
+# So long everything may take to come up [s].
+START_UP_S = 30.0
+# The wheels are pushed to and fro, gently [N m], for so many ticks each way.
+TORQUE, TICKS_EACH_WAY = 1e-3, 250
+MEDIAN_MS, SLOWEST_MS = 1.0, 5.0
+NO_TORQUE = Drive(np.zeros(4), np.zeros(4, dtype=bool), np.zeros(4, dtype=bool))
+DPI = 120
+
+# Counters of a link, at the host, that stand for frames which did not make it.
+LOST = ('lost_angles', 'lost_heartbeats', 'late', 'replayed', 'wrong_time')
+
+
+def run(progress: Progress, seconds: int = SECONDS) -> Result:
+    """Drive emulated links for so long, and count and time what comes back."""
+    context = get_context('spawn')
+    stop, (here, there) = context.Event(), context.Pipe()
+    links = context.Process(target=_be_links, args=(stop, there), daemon=True)
+    host = UdpBus('127.0.0.1:0', peers=())
+    links.start()
+    try:
+        if not here.poll(START_UP_S):
+            raise StudyError(f'the emulated links did not start within {START_UP_S:g} s')
+        host.add_peer(here.recv())
+        here.send(_address(host))
+        prototype = Prototype(
+            load_mechanism('prototype'), lambda: Port(host, 'fourbar_udp', _address(host)),
+            DbcCodec(), load_safety('prototype'), PERIOD_NS, ANSWER_TIMEOUT_S, False, steady_ns,
+            lambda time_ns: time_ns)
+        round_trips, counts = _drive(prototype, progress, seconds)
+        prototype.close()
+        stop.set()
+        told = here.recv() if here.poll(START_UP_S) else {}
+    finally:
+        stop.set()
+        links.join(START_UP_S)
+        host.shutdown()
+    return _result({**counts, **told}, round_trips, seconds)
+
+
+def steady_ns() -> int:
+    """Read the clock of both ends [ns]."""
+    return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
+
+
+def _address(bus: UdpBus) -> str:
+    host, port = bus.address
+    return f'{host}:{port}'
+
+
+def _be_links(stop: Event, host: Any) -> None:
+    """Be the four links, until told to stop; then tell what was lost on the way here."""
+    bus = UdpBus('127.0.0.1:0', peers=())
+    host.send(_address(bus))
+    bus.add_peer(host.recv())
+    port = Port(bus, 'fourbar_udp', _address(bus))
+    plant = Plant(load_mechanism('prototype'), load_table('prototype'), InitialState(), 5e-4,
+                  np.random.default_rng(0))
+    emulator = Emulator(
+        SimulatedTable(plant, 1_000_000), DbcCodec(), range(4), FirmwareSettings(),
+        ClockSettings((100.0, 107.0, 114.0, 121.0), (3e-5, 1.5e-5, -1.5e-5, -3e-5)),
+        np.random.default_rng(), steady_ns(), time.time_ns())
+    while not stop.is_set():
+        attend(emulator, port, steady_ns)
+    host.send({f'commands_{kind}': sum(one.counts[kind] for one in emulator.firmware)
+               for kind in ('lost_commands', 'replayed')})
+    port.close()
+
+
+def _drive(prototype: Prototype, progress: Progress, seconds: int
+           ) -> tuple[Array, dict[str, int]]:
+    """Return the round trips of the ticks, NaN where not all answered, and counts."""
+    begin_ns, tick = steady_ns(), 0
+
+    def step(drive: Drive) -> float | None:
+        nonlocal tick
+        due_ns = begin_ns + tick * PERIOD_NS
+        tick += 1
+        if (ahead_ns := due_ns - steady_ns()) > 0:
+            time.sleep(ahead_ns * 1e-9)
+        return prototype.step(due_ns, drive).timing[0]
+
+    while prototype.obstacles() or tick < TICKS_EACH_WAY:
+        step(NO_TORQUE)
+        if tick * PERIOD_NS > START_UP_S * 1e9:
+            raise StudyError(f'cannot be armed: {"; ".join(prototype.obstacles())}')
+    _arm(prototype)
+    before, found = _counts(prototype), []
+    for second in progress(range(seconds), seconds):
+        torque = TORQUE if second % 2 else -TORQUE
+        drive = Drive(np.full(4, torque), np.zeros(4, dtype=bool), np.ones(4, dtype=bool))
+        for _ in range(round(1e9) // PERIOD_NS):
+            answered = step(drive)
+            found.append(np.nan if answered is None else answered)
+            prototype.drive(drive)
+    after = _counts(prototype)
+    return np.array(found), {kind: after[kind] - before[kind] for kind in after}
+
+
+def _arm(device: Device) -> None:
+    device.gate_changed(DeviceState.ARMED)
+
+
+def _counts(prototype: Prototype) -> dict[str, int]:
+    facts = prototype.facts()
+    bus = {f'frames_{kind}': int(str(facts[f'frames_{kind}'])) for kind in ('sent', 'received')}
+    return {**bus, **{kind: sum(link.counts[kind] for link in prototype.links) for kind in LOST}}
+
+
+def _result(counts: dict[str, int], round_trips: Array, seconds: int) -> Result:
+    answered = round_trips[np.isfinite(round_trips)] * 1e3
+    unanswered = len(round_trips) - len(answered)
+    lost = unanswered + sum(counts[kind] for kind in counts if not kind.startswith('frames_'))
+    middle, slow, slowest = np.percentile(answered, [50.0, 99.0, 100.0]).tolist()
+    data = {**counts, 'seconds': seconds, 'ticks': len(round_trips),
+            'ticks_without_all_answers': unanswered, 'round_trip_p50_ms': middle,
+            'round_trip_p99_ms': slow, 'round_trip_max_ms': slowest}
+    text = '\n'.join([
+        f'{len(round_trips)} ticks, {counts["frames_sent"]} frames to the links, '
+        f'{counts["frames_received"]} from them',
+        f'round trip, from the question to the last of eight answers: median {middle:.3f} ms, '
+        f'99 % {slow:.3f} ms, slowest {slowest:.3f} ms'])
+    checks = [at_most('frames_lost', lost, '', 0),
+              at_least('frames_received', counts['frames_received'], '', 12.0 * len(round_trips)
+                       * 0.97),
+              at_most('round_trip_p50_ms', middle, 'ms', MEDIAN_MS),
+              at_most('round_trip_p99_ms', slow, 'ms', SLOWEST_MS)]
+    return Result(checks, data, text, {'bus.png': _png(answered)})
+
+
+def _png(answered: Array) -> bytes:
+    """Draw how many of the round trips took longer than so long."""
+    with rc_context(style.RC):
+        figure = Figure(figsize=(style.WIDTH_IN, 3.2), layout='constrained')
+        axes = figure.subplots()
+        ordered = np.sort(answered)
+        axes.plot(ordered, 1.0 - np.arange(len(ordered)) / len(ordered), color=COLOURS['link_a'])
+        for limit, share in ((MEDIAN_MS, 0.5), (SLOWEST_MS, 0.01)):
+            axes.plot(limit, share, 'v', color=COLOURS['limit'])
+            axes.annotate(f'limit {limit:g} ms', (limit, share), (6, 4),
+                          textcoords='offset points', color=COLOURS['limit'])
+        axes.set(xscale='log', yscale='log', xlabel='round trip [ms]',
+                 ylabel='share that took longer', ylim=(0.5 / len(ordered), 1.3))
+        axes.set_title('From the question of a tick to the last answer')
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format='png', dpi=DPI, facecolor=COLOURS['paper'])
+        return buffer.getvalue()
