@@ -18,9 +18,15 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from fourbar_ros.analysis.calibration.excitation import Excitation, MultiSine, SpinAndCoast
+from fourbar_ros.analysis.calibration.figure import links_figure, wheels_figure
+from fourbar_ros.analysis.calibration.links import link_estimate
+from fourbar_ros.analysis.calibration.signals import link_signal, LinkSignal, WheelSignal
+from fourbar_ros.analysis.calibration.wheels import wheel_estimate
 from fourbar_ros.analysis.style import COLOURS, legend_above, LINK_COLOURS, RC
 from fourbar_ros.control import Controller, ControllerSettings
 from fourbar_ros.device import SimulatedTable
+from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.device.protocol import no_torque
 from fourbar_ros.estimation import Estimator, EstimatorSettings
 from fourbar_ros.estimation.suspicion import ALARM
@@ -61,7 +67,8 @@ def main() -> None:
                 ('mechanics_conditioning', conditioning), ('table_friction', friction),
                 ('table_stiction', stiction), ('table_energy', energy),
                 ('table_sensors', sensors), ('estimation_suspicion', suspicion),
-                ('estimation_change_point', fold)):
+                ('estimation_change_point', fold), ('calibration_wheels', calibrated_wheels),
+                ('calibration_links', calibrated_links)):
             draw().savefig(IMAGES / f'{name}.png', dpi=110, bbox_inches='tight')
 
 
@@ -400,6 +407,48 @@ def _draw_arrivals(axes: Axes, truth: dict[int, Array], samples: list[tuple[int,
               label='handed out')
     axes.set(xlabel='time [ms]', ylabel='link a [mrad]', title='Samples on their way')
     axes.legend(loc='upper left')
+
+
+def _record(excitation: Excitation, seed: int) -> tuple[LinkSignal, WheelSignal]:
+    """Drive the prototype on its table by an excitation, and keep what it says."""
+    device = SimulatedTable(
+        Plant(load_mechanism('prototype'), load_table('prototype'), InitialState(), 1e-3,
+              np.random.default_rng(seed)), 4_000_000)
+    links, angles, ticks, wheels = [], [], [], []
+    now, drive = np.full(4, np.nan), no_torque()
+    for stamp_ns in range(0, 300_000_000_000, device.period_ns):
+        samples = device.step(stamp_ns, drive)
+        for reading in samples.links:
+            row = np.full(4, np.nan)
+            row[[LINK_NAMES.index(name) for name in reading.names]] = reading.angles
+            now = np.where(np.isfinite(row), row, now)
+            links.append(reading.stamp_ns)
+            angles.append(row)
+        ticks.append(stamp_ns * 1e-9)
+        wheels.append(samples.wheels)
+        if np.isfinite(now).all():
+            asked = excitation.efforts(stamp_ns * 1e-9, now, samples.wheels.speeds)
+            if asked is None:
+                break
+            drive = drive_by_name(list(asked), (), (), list(asked.values()))
+    return link_signal(np.array(links), np.array(angles), 0), WheelSignal(
+        np.array(ticks), *(np.array([getattr(sample, name) for sample in wheels])
+                           for name in ('angles', 'speeds', 'efforts')))
+
+
+def calibrated_wheels() -> Figure:
+    """Draw the calibration of the four wheels of the prototype."""
+    mechanism = load_mechanism('prototype')
+    signals = _record(SpinAndCoast(mechanism, range(4), 100.0, 0.02, 10.0), 0)
+    return wheels_figure([wheel_estimate(wheel, *signals) for wheel in range(4)])
+
+
+def calibrated_links() -> Figure:
+    """Draw the calibration of its links, from a file that is 5 % off."""
+    mechanism = load_mechanism('prototype')
+    signals = _record(MultiSine(mechanism, 30.0, 0.02), 0)
+    return links_figure(link_estimate(
+        replace(mechanism, link_inertias=1.05 * mechanism.link_inertias), *signals))
 
 
 if __name__ == '__main__':

@@ -58,6 +58,7 @@ COMMANDS = {
     'report': 'turn a bag into an HTML report and metrics',
     'replay': 'the estimator over a bag, with other settings',
     'demo': 'the whole loop, from start to report',
+    'calibrate': 'measure encoders, wheels and links of a device',
     'simulate': 'integrate one motion, without ROS',
     'bench': 'time the mechanics beside MuJoCo',
     'study': 'rerun a study and check what it finds',

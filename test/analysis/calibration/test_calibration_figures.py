@@ -1,0 +1,41 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Pictures of calibrations are drawn, and the same data give the same bytes."""
+
+from collections.abc import Callable
+from typing import Any
+
+from fourbar_ros.analysis.calibration.excitation import MultiSine, SpinAndCoast
+from fourbar_ros.analysis.calibration.figure import links_figure, rendered, wheels_figure
+from fourbar_ros.analysis.calibration.links import link_estimate
+from fourbar_ros.analysis.calibration.wheels import wheel_estimate
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.plant import Table
+
+
+def test_wheels_are_drawn(prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
+    signals = excited(prototype, lab, SpinAndCoast(prototype, [0], 60.0, 0.02, 3.0), 0)
+    estimates = [wheel_estimate(0, *signals)]
+    first, second = (rendered(lambda: wheels_figure(estimates), 'svg') for _ in range(2))
+    assert first == second
+    assert b'flywheel_a' in first and b'flywheel_b' not in first
+    assert rendered(lambda: wheels_figure(estimates), 'png').startswith(b'\x89PNG')
+
+
+def test_links_are_drawn(prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
+    estimate = link_estimate(
+        prototype, *excited(prototype, lab, MultiSine(prototype, 12.0, 0.02), 0))
+    picture = rendered(lambda: links_figure(estimate), 'svg')
+    assert all(name in picture for name in (b'link_a', b'link_b', b'link_c', b'link_d'))

@@ -1,0 +1,130 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""`fourbar calibrate` over real DDS: it finds what the plant has, and leaves no wheel driven."""
+
+import json
+import signal
+
+from fourbar_ros.mechanism import load_mechanism
+import numpy as np
+import pytest
+import yaml
+
+pytestmark = pytest.mark.node
+
+WHEELS = ('wheels', '--wheels', 'flywheel_b', '--speed', '45', '--coast', '2.5', '--yes')
+
+
+@pytest.fixture(scope='module')
+def plant(module_suite, probe):
+    """Run the bench-scale linkage on the table of a laboratory; no controller."""
+    module_suite.node('plant', {
+        'mechanism': 'prototype', 'table': 'prototype', 'command_timeout': 0.1})
+    probe.newest('flywheel_states')
+    probe.status('device_status', state='disarmed')
+    probe.unfollow()
+    return probe
+
+
+@pytest.fixture
+def start(plant, module_suite):
+    """Return a function that starts the command, with the plant at rest and disarmed."""
+    assert plant.trigger('sim/reset').success
+    plant.status('device_status', state='disarmed')
+    return lambda *arguments: module_suite.start('calibrate', *arguments)
+
+
+def check_left_without_torque(plant):
+    """Fail unless the device is disarmed, and the wheels got zero torque before that."""
+    plant.catch_up()
+    assert plant.state() == 'disarmed'
+    commands = plant.received['flywheel_command']
+    assert list(commands[-1].name) == [f'flywheel_{letter}' for letter in 'abcd']
+    assert list(commands[-1].effort) == [0.0] * 4
+
+
+def test_zeros_of_the_encoders(start, tmp_path):
+    """The plant's sensors have none: 500 samples of 0.1 deg, five standard errors."""
+    made, numbers = tmp_path / 'mechanism.yaml', tmp_path / 'zeros.json'
+    process = start('encoders', '--pose', 'link_a=0', 'link_b=60deg', '--duration', '2',
+                    '-o', str(made), '--json', str(numbers))
+    assert process.end() == 0, process.stderr
+    offsets = load_mechanism(str(made)).link_angle_offsets
+    np.testing.assert_allclose(offsets, 0.0, atol=5.0 * 1.75e-3 / np.sqrt(450))
+    assert offsets.any()
+    found = json.loads(numbers.read_text())
+    assert min(found['samples']) > 450
+    assert all(check['passed'] for check in found['checks'])
+
+
+def test_one_wheel(start, plant, tmp_path):
+    """To 1 %; and the recording, evaluated again, says the same."""
+    plant.follow('flywheel_command')
+    plant.catch_up()
+    made, numbers, again, bag, report = (tmp_path / name for name in (
+        'mechanism.yaml', 'wheels.json', 'again.json', 'bag', 'report.yaml'))
+    process = start(*WHEELS, '-o', str(made), '--json', str(numbers), '--record', str(bag),
+                    '--report', str(report))
+    assert process.end() == 0, process.stderr + process.stdout
+    found = json.loads(numbers.read_text())
+    inertia, coulomb = found['quantities'][:2]
+    assert inertia['value'] == pytest.approx(1.2e-4, rel=0.01)
+    assert coulomb['value'] == pytest.approx(1e-3, rel=0.01)
+    controller = yaml.safe_load(report.read_text())['controller']
+    assert controller['bearing_coulomb'] == coulomb['value']
+    np.testing.assert_array_equal(
+        load_mechanism(str(made)).flywheel_inertias, [1.2e-4, inertia['value'], 1.2e-4, 1.2e-4])
+    check_left_without_torque(plant)
+    process = start('wheels', '--bag', str(bag), '--json', str(again))
+    assert process.end() == 0, process.stderr
+    assert json.loads(again.read_text())['quantities'] == found['quantities']
+
+
+def test_device_that_is_disarmed_meanwhile_ends_it(start, plant):
+    process = start(*WHEELS)
+    plant.status('device_status', state='armed')
+    plant.arm(False)
+    assert process.end() == 2
+    assert 'the device does not drive any more: disarmed (disarmed on request)' in process.stderr
+    check_left_without_torque(plant)
+
+
+def test_interrupt_leaves_the_wheels_without_torque(start, plant):
+    process = start(*WHEELS)
+    plant.status('device_status', state='armed')
+    driven = plant.received['flywheel_command']
+    begin = len(driven)
+    plant.wait(lambda: any(any(command.effort) for command in driven[begin:]))
+    assert process.end(signal.SIGINT) == 130
+    assert process.stderr.splitlines()[-1] == 'fourbar calibrate: interrupted'
+    plant.status('device_status', state='disarmed')
+    check_left_without_torque(plant)
+
+
+def test_nobody_else_may_drive(start, plant):
+    plant.drive([0.0] * 4)
+    process = start(*WHEELS)
+    assert process.end() == 2
+    assert process.stderr.splitlines()[-1] == (
+        'fourbar calibrate: /flywheel_command has a publisher already: stop the controller')
+    assert plant.state() == 'disarmed'
+
+
+def test_without_a_device_it_says_so(start):
+    process = start('encoders', '--pose', 'link_a=0', 'link_b=1', '--ros-args', '-r',
+                    '__ns:=/elsewhere')
+    assert process.end() == 2
+    assert process.stderr == (
+        'fourbar calibrate: no device found: no device_status came within 5 s\n')
