@@ -25,6 +25,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
+PROTOTYPE, SIMULATION = (ROOT / 'launch' / f'{name}.launch.py' for name in ('prototype', 'sim'))
 
 each_file = pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
 
@@ -59,8 +60,8 @@ def arguments(path):
             for name, given in calls(path, 'DeclareLaunchArgument')}
 
 
-def test_there_is_one_for_the_simulation():
-    assert [path.name for path in FILES] == ['sim.launch.py']
+def test_there_is_one_for_the_simulation_and_one_for_the_prototype():
+    assert FILES == [PROTOTYPE, SIMULATION]
 
 
 @each_file
@@ -120,8 +121,8 @@ class Stub(ModuleType):
         return lambda *args, **given: SimpleNamespace(args=args, **given)
 
 
-def nodes_started(monkeypatch, path, given):
-    """Return the parameters of each node that a launch file starts, without launch."""
+def actions(monkeypatch, path, given):
+    """Return what a launch file starts with some arguments, as remembered calls."""
     for name in ('launch', 'launch.actions', 'launch.event_handlers', 'launch.substitutions',
                  'launch_ros', 'launch_ros.actions'):
         monkeypatch.setitem(sys.modules, name, Stub(name))
@@ -133,15 +134,25 @@ def nodes_started(monkeypatch, path, given):
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     _, handler = module._start(arguments(path))
-    return {node.executable: dict(pair for part in node.parameters for pair in part.items())
-            for node in handler.args[0].on_exit}
+    return handler.args[0].on_exit
+
+
+def nodes_started(monkeypatch, path, given):
+    """Return the parameters of each node that a launch file starts, beside those in files."""
+    return {node.executable: dict(pair for part in node.parameters if isinstance(part, dict)
+                                  for pair in part.items())
+            for node in actions(monkeypatch, path, given)}
 
 
 @each_file
+def test_namespace_is_that_of_all_nodes(monkeypatch, path):
+    assert {node.namespace for node in actions(monkeypatch, path, {'namespace': 'lab'})} == {'lab'}
+
+
 @pytest.mark.parametrize(('clock', 'simulated'), [
     ('realtime', False), ('fast', True), ('lockstep', True)])
-def test_one_argument_sets_the_time_of_all_nodes(monkeypatch, path, clock, simulated):
-    started = nodes_started(monkeypatch, path, {'clock': clock})
+def test_one_argument_sets_the_time_of_all_nodes(monkeypatch, clock, simulated):
+    started = nodes_started(monkeypatch, SIMULATION, {'clock': clock})
     assert set(started) == {'plant', 'estimator', 'controller'}
     assert {name: given['use_sim_time'] for name, given in started.items()} == dict.fromkeys(
         started, simulated)
@@ -149,6 +160,50 @@ def test_one_argument_sets_the_time_of_all_nodes(monkeypatch, path, clock, simul
 
 
 @each_file
-def test_clock_that_is_not_given_is_left_to_the_parameters_file(monkeypatch, path):
-    for given in nodes_started(monkeypatch, path, {}).values():
-        assert given == {}
+def test_what_is_not_given_is_left_to_the_parameters_files(monkeypatch, path):
+    started = nodes_started(monkeypatch, path, {})
+    assert len(started) == 3
+    assert all(given == {} for given in started.values())
+
+
+def test_prototype_has_its_parameters_file_and_then_that_of_the_user(monkeypatch):
+    for node in actions(monkeypatch, PROTOTYPE, {'params_file': 'lab.yaml', 'rate': '200'}):
+        own, users, *_ = node.parameters
+        assert Path(own) == ROOT / 'config' / 'nodes_prototype.yaml'
+        assert users == 'lab.yaml'
+
+
+def test_arguments_of_the_bus_go_to_the_hardware_node_alone(monkeypatch):
+    bus = {'bus.interface': 'slcan', 'bus.channel': '/dev/ttyACM0', 'bus.options': 'a=1 b=2'}
+    assert nodes_started(monkeypatch, PROTOTYPE, bus) == {
+        'hardware': bus, 'estimator': {}, 'controller': {}}
+
+
+@pytest.mark.parametrize(('given', 'host', 'links'), [
+    ({}, ('fourbar_udp', '127.0.0.1:29536', 'peers=127.0.0.1:29537'),
+     ('fourbar_udp', '127.0.0.1:29537', 'peers=127.0.0.1:29536')),
+    ({'bus.channel': '127.0.0.1:1', 'emulator_channel': '127.0.0.1:2'},
+     ('fourbar_udp', '127.0.0.1:1', 'peers=127.0.0.1:2'),
+     ('fourbar_udp', '127.0.0.1:2', 'peers=127.0.0.1:1')),
+    ({'bus.interface': 'socketcan', 'bus.channel': 'vcan0', 'bus.options': 'fd=false'},
+     ('socketcan', 'vcan0', 'fd=false'), ('socketcan', 'vcan0', 'fd=false')),
+    ({'bus.interface': 'socketcan'}, ('socketcan',), ('socketcan',)),
+])
+def test_emulated_links_are_on_the_bus_of_the_host(monkeypatch, given, host, links):
+    started = nodes_started(
+        monkeypatch, PROTOTYPE, {'emulate': 'true', 'codec': 'odrive', **given})
+    assert list(started) == ['prototype_emulator', 'hardware', 'estimator', 'controller']
+    for name, bus in (('hardware', host), ('prototype_emulator', links)):
+        assert started[name] == {
+            'codec': 'odrive', **dict(zip(('bus.interface', 'bus.channel', 'bus.options'), bus))}
+
+
+def test_channels_of_emulated_links_are_the_defaults_of_their_node(monkeypatch):
+    defaults = {row.name: row.default for row in TABLES['prototype_emulator']}
+    started = nodes_started(monkeypatch, PROTOTYPE, {'emulate': 'true'})['prototype_emulator']
+    assert started == {name: defaults[name] for name in started}
+
+
+def test_emulate_is_true_or_false(monkeypatch):
+    with pytest.raises(RuntimeError, match='emulate must be true or false, got maybe'):
+        actions(monkeypatch, PROTOTYPE, {'emulate': 'maybe'})
