@@ -38,9 +38,11 @@ from fourbar_ros.device.prototype.messages import (
     Sync,
     WheelReport,
 )
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
+
+repeatable = settings(deadline=None, derandomize=True)
 
 CODEC = DbcCodec('prototype')
 FILE = share_directory() / 'config' / 'prototype.dbc'
@@ -81,6 +83,7 @@ def read(frame):
     return CODEC.from_host(frame) if message is None else message
 
 
+@repeatable
 @given(links, torques, st.booleans(), st.booleans(), bytes_)
 def test_command(link, value, by_speed, enable, sequence):
     command = Command(link, value, by_speed, enable, sequence)
@@ -89,6 +92,7 @@ def test_command(link, value, by_speed, enable, sequence):
     assert replace(back, value=value) == command
 
 
+@repeatable
 @given(links, st.floats(0.0, 1000.0), st.floats(0.0, 6553.5))
 def test_limits_are_never_widened(link, torque, speed):
     back = read(written(Limits(link, torque, speed)))
@@ -96,6 +100,7 @@ def test_limits_are_never_widened(link, torque, speed):
     assert speed - 0.1 - 1e-9 <= back.speed <= speed * (1.0 + 1e-6)
 
 
+@repeatable
 @given(bytes_)
 def test_sync(counter):
     assert read(written(Sync(counter))) == Sync(counter)
@@ -106,6 +111,7 @@ def test_stop_and_release(message):
     assert read(written(message)) == message
 
 
+@repeatable
 @given(links, bytes_, st.floats(-1e4, 1e4), times)
 def test_wheel(link, counter, angle, time_us):
     back = read(written(WheelReport(link, counter, angle, TURN, time_us, WRAP_US)))
@@ -117,6 +123,7 @@ def test_wheel(link, counter, angle, time_us):
     assert (time_us - back.time_us + WRAP_US // 2) % WRAP_US == pytest.approx(WRAP_US // 2, abs=5)
 
 
+@repeatable
 @given(links, torques, st.none() | bytes_, st.sampled_from(LinkState))
 def test_motor(link, torque, answers, state):
     report = MotorReport(link, torque, answers, state, 200 + link)
@@ -125,6 +132,7 @@ def test_motor(link, torque, answers, state):
     assert replace(back, torque=torque) == report
 
 
+@repeatable
 @given(links, nibbles, st.floats(-pi, pi), st.none() | st.floats(-32.767, 32.767), times)
 def test_angle(link, sequence, angle, rate, time_us):
     back = read(written(AngleReport(link, sequence, angle, rate, time_us, WRAP_US)))
@@ -136,12 +144,14 @@ def test_angle(link, sequence, angle, rate, time_us):
     assert (time_us - back.time_us + WRAP_US // 2) % WRAP_US == pytest.approx(WRAP_US // 2, abs=5)
 
 
+@repeatable
 @given(links, bytes_, st.integers(0, 2 ** 32 - 1), bytes_)
 def test_clock(link, counter, time_us, boot):
     report = ClockReport(link, counter, time_us, boot)
     assert read(written(report)) == report
 
 
+@repeatable
 @given(links, nibbles, st.sampled_from(LinkState), st.frozensets(st.sampled_from(LINK_FAULTS)),
        st.none() | st.floats(0.0, 40.94), st.none() | st.floats(-204.7, 204.7), bytes_)
 def test_heartbeat(link, sequence, state, faults, voltage, temperature, boot):

@@ -38,9 +38,11 @@ from fourbar_ros.device.prototype.messages import (
     WheelReport,
 )
 from fourbar_ros.device.prototype.odrive_codec import OdriveCodec
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
+
+repeatable = settings(deadline=None, derandomize=True)
 
 CONSTANTS = (0.03, 0.04, 0.05, 0.06)
 SINGLE = 2.0 ** -23
@@ -73,6 +75,7 @@ def heartbeat(link, error, state):
     return Frame(identifier(link, 0x01), struct.pack('<IBBBx', error, state, 0, 0))
 
 
+@repeatable
 @given(links, st.floats(-1e4, 1e4), st.floats(-1e4, 1e4))
 def test_wheel(link, angle, speed):
     frame, = LINK.to_host(WheelReport(link, 3, angle, TURN, 5, 1 << 20, speed))
@@ -84,6 +87,7 @@ def test_wheel(link, angle, speed):
     assert back.speed == pytest.approx(speed, rel=SINGLE, abs=1e-40)
 
 
+@repeatable
 @given(links, st.floats(-1e3, 1e3))
 def test_motor(link, torque):
     frame, = LINK.to_host(MotorReport(link, torque, 7, LinkState.ARMED))
@@ -91,6 +95,7 @@ def test_motor(link, torque):
     assert back == MotorReport(link, pytest.approx(torque, rel=SINGLE, abs=1e-40), None, None)
 
 
+@repeatable
 @given(links, st.floats(0.0, 10.0), st.floats(0.0, 1e4))
 def test_limits(link, torque, speed):
     limits, = told(HOST, LINK, Limits(link, torque, speed))
@@ -98,6 +103,7 @@ def test_limits(link, torque, speed):
                             pytest.approx(speed, rel=2 * SINGLE, abs=1e-40))
 
 
+@repeatable
 @given(links, st.floats(-10.0, 10.0), st.booleans(), st.booleans())
 def test_command_to_whatever_was_told_before(link, value, by_speed, enable):
     """The last word of the frames is the command, whichever were sent before."""
@@ -221,6 +227,7 @@ def test_state_and_faults_of_an_odrive(error, axis_state, state, faults):
     assert (report.sequence, report.boot) == (None, None)
 
 
+@repeatable
 @given(links, st.sampled_from(LinkState),
        st.frozensets(st.sampled_from(('driver', 'encoder', 'overspeed', 'undervoltage'))),
        st.floats(0.0, 60.0), st.floats(-20.0, 150.0))
