@@ -99,7 +99,8 @@ class OdriveCodec:
         if torque_constants is not None and not (len(torque_constants) == len(LINKS) and all(
                 isfinite(constant) and constant > 0.0 for constant in torque_constants)):
             raise BusError('ODrives need four torque constants, positive and finite, got '
-                           f'{list(torque_constants)}')
+                           f'{list(torque_constants)}: give motor_torque_constants in the '
+                           'mechanism file')
         self._sensors = DbcCodec(sensors, _SENSORS)
         file = DbcFile(name)
         constants: Sequence[float | None] = (

@@ -223,7 +223,9 @@ class Prototype(Device):
                        if link.heartbeat_ns is None]:
             told['missing'] = f'waiting for {", ".join(missing)}: never heard'
         for finding in self._safety.findings():
-            told[finding.text.partition(':')[0]] = finding.text
+            # The worst first, and none hides another.
+            where = finding.text.partition(':')[0]
+            told[where] = '; '.join(filter(None, (told.get(where), finding.text)))
         return told
 
     def facts(self) -> dict[str, object]:

@@ -103,6 +103,13 @@ def test_heartbeat_lost_while_armed_is_an_emergency_stop(driven) -> None:
     assert_coasting(driven)
 
 
+def test_diagnosis_tells_all_of_a_link_the_worst_first(driven) -> None:
+    driven.wire.emulators[0].trouble('link_c', 'hot')
+    driven.run(1.5)
+    assert driven.prototype.diagnosis() == {
+        'link_c': 'link_c: it has 90 deg C, limit 80; link_c: it has 90 deg C, limit 65'}
+
+
 @pytest.mark.parametrize('seconds', [1.0, 10.0])
 def test_bus_that_drops_out_leaves_wheels_coasting_until_somebody_arms(driven, seconds) -> None:
     emulator = driven.wire.emulators[0]
