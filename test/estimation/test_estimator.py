@@ -233,6 +233,29 @@ def test_three_links_tell_the_branch(mechanism: Mechanism, branch: str, missing:
         assert np.abs(wrapped).max() < 4.0 * 3.0 * NOISE, f'seed {seed}'
 
 
+def test_links_that_are_measured_one_after_the_other_start_it(mechanism: Mechanism) -> None:
+    """As on a bus: each at a time of its own, and none tells enough alone."""
+    angles = angles_of(mechanism, 'open')
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        estimator = Estimator(mechanism, EstimatorSettings())
+        for count, link in enumerate(rng.permutation(4)[:3], 1):
+            estimator.measure(FIRST_NS - 4_000_000 + count * 1_000_000, names_of(link),
+                              [angles[link] + NOISE * rng.standard_normal()])
+        estimate = estimator.tick(FIRST_NS, STILL)
+        assert estimate is not None, f'seed {seed}'
+        wrapped = np.angle(np.exp(1j * (estimate.link_angles - angles)))
+        assert np.abs(wrapped).max() < 4.0 * 3.0 * NOISE, f'seed {seed}'
+
+
+def test_links_that_are_measured_long_after_each_other_do_not(paper: Mechanism) -> None:
+    estimator = Estimator(paper, EstimatorSettings())
+    angles = angles_of(paper, 'open')
+    for count, link in enumerate((0, 1, 3)):
+        estimator.measure(FIRST_NS + count * 30_000_000, names_of(link), [angles[link]])
+    assert estimator.tick(FIRST_NS + 60_000_000, STILL) is None
+
+
 @pytest.mark.parametrize('links', [(0,), (0, 1), (0, 2), (1, 3), (2, 3)])
 def test_fewer_do_not_start_it(links: tuple[int, ...], paper: Mechanism) -> None:
     estimator = Estimator(paper, EstimatorSettings())
