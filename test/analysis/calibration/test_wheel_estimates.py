@@ -42,7 +42,7 @@ def test_truth_is_found_to_one_percent_and_covered(
     """
     On the table of the prototype, links free: seeds 0 to 9, each wheel five times.
 
-    Of 60 intervals at 95 % fewer than the bound cover the truth once in a thousand.
+    Of 30 intervals at 95 % fewer than the bound cover the truth once in a thousand.
     """
     uneven = replace(prototype, flywheel_inertias=np.array([1.2e-4, 1.3e-4, 1.1e-4, 1.25e-4]))
     covered = 0
