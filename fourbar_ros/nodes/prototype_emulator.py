@@ -19,6 +19,7 @@ import time
 
 from fourbar_ros.device.prototype.emulator import (
     BUS_TROUBLES,
+    check_trouble,
     ClockSettings,
     Emulator,
     LINK_TROUBLES,
@@ -111,13 +112,21 @@ class EmulatorNode(Node):
             self._runtime.executor.spin_once(timeout_sec=0.0)
 
     def _changed(self, values):
-        self._trouble(self._values, values)
+        """Make and end trouble and faults: what is refused leaves all as it was."""
+        for name in TROUBLES:
+            check_trouble(target_of(name), values[name])
         apply_faults(self._emulator.table, self._values, values)
+        self._trouble(self._values, values)
 
     def _trouble(self, before, now):
         for name in TROUBLES:
             if now[name] != before[name]:
-                self._emulator.trouble(name.partition('.')[2], now[name])
+                self._emulator.trouble(target_of(name), now[name])
+
+
+def target_of(parameter):
+    """Return what `trouble.TARGET` makes trouble for."""
+    return parameter.partition('.')[2]
 
 
 def main(argv):

@@ -85,6 +85,20 @@ class ClockSettings:
     drifts: tuple[float, ...]
 
 
+def check_trouble(target: str, kind: str) -> None:
+    """
+    Make sure that there is such a trouble.
+
+    :param target, kind: as for `Emulator.trouble`.
+    :raises TroubleError: there is no such target or trouble.
+    """
+    known = BUS_TROUBLES if target == 'bus' else LINK_TROUBLES
+    if target != 'bus' and target not in LINK_NAMES:
+        raise TroubleError(f'trouble for {target}: must be bus or {", ".join(LINK_NAMES)}')
+    if kind not in ('', *known):
+        raise TroubleError(f'trouble of {target} must be one of {", ".join(known)}, got {kind!r}')
+
+
 class Emulator:
     """
     Four links, or some of them, and the table under them.
@@ -143,12 +157,7 @@ class Emulator:
         :param kind: of `LINK_TROUBLES` or `BUS_TROUBLES`.
         :raises TroubleError: there is no such target or trouble.
         """
-        known = BUS_TROUBLES if target == 'bus' else LINK_TROUBLES
-        if target != 'bus' and target not in LINK_NAMES:
-            raise TroubleError(f'trouble for {target}: must be bus or {", ".join(LINK_NAMES)}')
-        if kind not in ('', *known):
-            raise TroubleError(f'trouble of {target} must be one of {", ".join(known)}, '
-                               f'got {kind!r}')
+        check_trouble(target, kind)
         self._troubles[target] = kind
         if target == 'bus':
             return
