@@ -313,6 +313,7 @@ def test_last_word_on_the_bus_is_no_torque(suite, make_probe, number):
     codec = DbcCodec('prototype')
     said = [codec.from_host(frame) for frame in frames]
     assert any(isinstance(message, Command) and message.enable for message in said)
+    assert all(isinstance(message, Command) for message in said[-4:])
     assert [(message.link, message.value, message.by_speed, message.enable)
             for message in said[-4:]] == [(link, 0.0, False, False) for link in range(4)]
     assert bench.last_driven_ns() < sent_ns + AT_ONCE_NS
