@@ -267,6 +267,11 @@ class Suite:
         ros_args += arguments
         return self.start(name, *(ros_args if ros_args[1:] else ()), fresh=fresh)
 
+    @staticmethod
+    def bus():
+        """Return parameters of the nodes on a bus with which they find each other."""
+        return on_a_bus()
+
     def device(self, device, parameters=None, namespace='', emulator=None):
         """
         Start a testbed of the bench scale, simulated or on a bus, and return its processes.
