@@ -15,7 +15,12 @@
 """Linkages that many tests use."""
 
 from fourbar_ros.mechanism import load_mechanism, Mechanism
+from hypothesis import settings
 import pytest
+
+# How long an example takes is no law of nature: other tests run on the same machine.
+settings.register_profile('patient', deadline=None)
+settings.load_profile('patient')
 
 
 @pytest.fixture(scope='session')

@@ -225,6 +225,7 @@ def test_process_that_dies_is_told() -> None:
         list(in_processes(os._exit, [1, 1], 2))
 
 
+@pytest.mark.node
 def test_interrupt_of_all_processes_ends_them_without_a_word() -> None:
     code = ('import time\n'
             'from fourbar_ros.analysis.campaign import in_processes\n'

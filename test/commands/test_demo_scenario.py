@@ -20,6 +20,7 @@ from fourbar_ros.commands.demo import _one_move, _write_parameters
 from fourbar_ros.configuration import share_directory
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.loop import load_scenario
+from fourbar_ros.nodes.tables import TABLES
 import pytest
 import yaml
 
@@ -30,7 +31,8 @@ def test_nodes_get_the_scenario_with_the_duration_of_its_setpoint(
 ) -> None:
     scenario = load_scenario(name)
     path = tmp_path / 'parameters.yaml'
-    assert _write_parameters(scenario, path) == ['--ros-args', '--params-file', str(path)]
+    assert _write_parameters(scenario, 'simulated', path) == [
+        '--ros-args', '--params-file', str(path)]
     written = {key.removeprefix('/**/'): section['ros__parameters']
                for key, section in yaml.safe_load(path.read_text()).items()}
     wanted = scenario.parameters()
@@ -46,7 +48,8 @@ def test_estimator_and_controller_get_the_believed_mechanism(tmp_path: Path) -> 
         '3.4e-7', '4.0e-7')
     (tmp_path / 'heavy.yaml').write_text(heavy)
     (tmp_path / 'mine.yaml').write_text(yaml.safe_dump({**content, 'believed': './heavy.yaml'}))
-    _write_parameters(_one_move(str(tmp_path / 'mine.yaml')), tmp_path / 'parameters.yaml')
+    _write_parameters(
+        _one_move(str(tmp_path / 'mine.yaml')), 'simulated', tmp_path / 'parameters.yaml')
     written = yaml.safe_load((tmp_path / 'parameters.yaml').read_text())
     assert {key: section['ros__parameters']['mechanism'] for key, section in written.items()} == {
         '/**/plant': 'paper', '/**/estimator': str(tmp_path / 'heavy.yaml'),
@@ -71,3 +74,18 @@ def test_scenario_that_is_no_demo_is_refused_in_one_line(
         _one_move(preset)
     assert told in str(caught.value)
     assert '\n' not in str(caught.value)
+
+
+def test_on_a_bus_the_parameters_of_the_plant_are_shared_out(tmp_path: Path) -> None:
+    """Each has what its table lists, and the two ends of the bus find each other."""
+    path = tmp_path / 'parameters.yaml'
+    _write_parameters(_one_move('prototype'), 'prototype', path)
+    written = {key.rpartition('/')[2]: values['ros__parameters']
+               for key, values in yaml.safe_load(path.read_text()).items()}
+    assert set(written) == {'prototype_emulator', 'hardware', 'estimator', 'controller'}
+    for node, values in written.items():
+        rows = {row.name: row for row in TABLES[node]}
+        assert all(rows[name].checked(value) == value for name, value in values.items())
+    links, host = written['prototype_emulator'], written['hardware']
+    assert links['bus.options'] == f'peers={host["bus.channel"]}'
+    assert host['bus.options'] == f'peers={links["bus.channel"]}'

@@ -161,7 +161,7 @@ def test_progress_does_not_change_what_it_shows(stub: Stub, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(('arguments', 'complaint'), [
-    (['atlantis'], "no study 'atlantis' (known are validation, consistency, crossing)"),
+    (['atlantis'], "no study 'atlantis' (known are validation, consistency, crossing, bus)"),
     (['consistency', '--runs', '0'], '--runs must be from 1 to 1000000, got 0'),
     (['consistency', '--jobs', '0'], '--jobs must be from 1 to 1024, got 0'),
     (['consistency', '--seed', '-1'], '--seed must be from 0 to'),
