@@ -100,16 +100,18 @@ def _address(bus: UdpBus) -> str:
 
 def _be_links(stop: Event, host: Any) -> None:
     """Be the four links, until told to stop; then tell what was lost on the way here."""
-    bus = UdpBus('127.0.0.1:0', peers=())
-    host.send(_address(bus))
-    bus.add_peer(host.recv())
-    port = Port(bus, 'fourbar_udp', _address(bus))
     plant = Plant(load_mechanism('prototype'), load_table('prototype'), InitialState(), 5e-4,
                   np.random.default_rng(0))
     emulator = Emulator(
         SimulatedTable(plant, 1_000_000), DbcCodec(), range(4), FirmwareSettings(),
         ClockSettings((100.0, 107.0, 114.0, 121.0), (3e-5, 1.5e-5, -1.5e-5, -3e-5)),
         np.random.default_rng(), steady_ns(), time.time_ns())
+    # Everything is compiled before somebody speaks to it.
+    emulator.advance(emulator.next_ns)
+    bus = UdpBus('127.0.0.1:0', peers=())
+    host.send(_address(bus))
+    bus.add_peer(host.recv())
+    port = Port(bus, 'fourbar_udp', _address(bus))
     while not stop.is_set():
         attend(emulator, port, steady_ns)
     host.send({f'commands_{kind}': sum(one.counts[kind] for one in emulator.firmware)

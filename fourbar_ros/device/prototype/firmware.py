@@ -104,8 +104,13 @@ class Firmware:
         if last is not None:
             ahead = (command.sequence - last.sequence) % SEQUENCES
             if ahead == 0 or ahead > SEQUENCES // 2:
-                self.counts['replayed'] += 1
-                return
+                # After a silence nobody knows how many were lost; but nothing that would drive a
+                # wheel begins a new count.
+                silent = now_ns - self._command_ns > self._settings.command_timeout_s * 1e9
+                if command.enable or not silent:
+                    self.counts['replayed'] += 1
+                    return
+                ahead = 1
             self.counts['lost_commands'] += ahead - 1
         self._command, self._command_ns = command, now_ns
         self.sequence = command.sequence

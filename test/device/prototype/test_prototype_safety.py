@@ -247,6 +247,21 @@ def test_old_command_does_not_move_a_wheel(driven) -> None:
     assert firmware(driven, 0).counts['replayed'] >= 1
 
 
+def test_host_that_counts_anew_is_heard_after_a_silence_and_drives_nothing_by_that(world) -> None:
+    """As after an outage in which more commands were lost than the count goes."""
+    link, now_ns = firmware(world, 0), world.wire.now_ns
+    limit_ns = 110_000_000
+    disarm, drive = (Command(0, 0.0, False, enable, (link.sequence + 200) % 256)
+                     for enable in (False, True))
+    link.command(disarm, now_ns)
+    link.command(drive, now_ns + limit_ns)
+    assert link.sequence != disarm.sequence
+    assert link.counts['replayed'] == 2
+    link.command(disarm, now_ns + limit_ns)
+    assert link.sequence == disarm.sequence
+    assert link.state is LinkState.IDLE
+
+
 def test_wheel_that_turns_too_fast_is_not_armed(world) -> None:
     world.torque(0.03, 0.0, 0.0, 0.0)
     assert world.arm()[0]
