@@ -25,7 +25,7 @@ import sys
 import time
 from typing import Any
 
-from fourbar_ros.commands.files import check_new_folder, OutputError, whole_folder, write_whole
+from fourbar_ros.commands.files import check_new_folder, OutputError, whole_folder, write_files
 from fourbar_ros.commands.progress import show_progress
 from fourbar_ros.commands.ros import add_ros_arguments, testbed_client
 from fourbar_ros.commands.setpoint import parse_goal
@@ -270,12 +270,7 @@ def _write(args: argparse.Namespace, outcome: Any, name: str, bag: Path) -> list
         from fourbar_ros.analysis.calibration.figure import rendered
 
         contents[args.figure] = rendered(outcome.figure, args.figure.suffix[1:])
-    for path, content in contents.items():
-        with write_whole(path) as file:
-            if isinstance(content, bytes):
-                file.buffer.write(content)
-            else:
-                file.write(content)
+    write_files(contents)
     return list(contents)
 
 

@@ -25,7 +25,6 @@ from math import degrees
 import os
 from pathlib import Path
 import shutil
-import socket
 from typing import Any, TYPE_CHECKING
 
 from fourbar_ros.commands.files import OutputError, write_whole
@@ -219,7 +218,8 @@ def _on_a_bus(plant: dict[str, Any]) -> dict[str, dict[str, Any]]:
                     or name.startswith('initial.')}
     of_the_device = {name: plant[name] for name in (
         'mechanism', 'rate', 'command_timeout', 'sensor_timeout', 'timeout_action')}
-    host, links = (f'127.0.0.1:{port}' for port in _free_ports(2))
+    from fourbar_ros.device.prototype.parameters import free_addresses
+    host, links = free_addresses(2)
     bus = {'bus.interface': 'fourbar_udp'}
     return {
         'prototype_emulator': {
@@ -228,16 +228,6 @@ def _on_a_bus(plant: dict[str, Any]) -> dict[str, dict[str, Any]]:
         'hardware': {
             **of_the_device, **bus, 'bus.channel': host, 'bus.options': f'peers={links}'},
     }
-
-
-def _free_ports(count: int) -> list[int]:
-    """Find UDP ports that nobody uses now."""
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-                   for _ in range(count)]
-        for one in sockets:
-            one.bind(('127.0.0.1', 0))
-        return [one.getsockname()[1] for one in sockets]
 
 
 def _duration(scenario: Scenario) -> float:

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 import os
 from pathlib import Path
@@ -55,6 +55,20 @@ def write_whole(path: Path) -> Iterator[TextIO]:
         if isinstance(error, OSError):
             raise OutputError(f'cannot write {path}: {error.strerror or error}') from None
         raise
+
+
+def write_files(contents: Mapping[Path, str | bytes]) -> None:
+    """
+    Write files, each whole or not at all.
+
+    :raises OutputError: as :func:`write_whole`; those before it are written.
+    """
+    for path, content in contents.items():
+        with write_whole(path) as file:
+            if isinstance(content, bytes):
+                file.buffer.write(content)
+            else:
+                file.write(content)
 
 
 def check_new_folder(folder: Path) -> None:

@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study, print and write what it found."""
     from fourbar_ros.analysis.checks import checks_as_json, print_checks
-    from fourbar_ros.commands.files import OutputError, write_whole
+    from fourbar_ros.commands.files import OutputError, write_files
     from fourbar_ros.commands.progress import show_progress
     from fourbar_ros.mechanism.compiled import announced
 
@@ -74,12 +74,7 @@ def run(args: argparse.Namespace) -> int:
     files: Mapping[Path, str | bytes] = {
         **{folder / name: content for name, content in result.files.items()},
         folder / f'{args.name}.json': text, **({args.json: text} if args.json else {})}
-    for path, content in files.items():
-        with write_whole(path) as file:
-            if isinstance(content, bytes):
-                file.buffer.write(content)
-            else:
-                file.write(content)
+    write_files(files)
 
     print(result.text)
     print_checks(result.checks)

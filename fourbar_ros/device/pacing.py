@@ -83,6 +83,11 @@ class Pace(ABC):
         """
         return self._take(steady_ns) if self.is_due(steady_ns) else None
 
+    @property
+    def next_ns(self) -> int:
+        """Stamp of the next tick, if none is left out [ns]."""
+        return self._next_ns
+
     def answered(self, stamp_ns: int) -> bool:
         """Take note of a command, by its stamp; tell whether a tick waited for it."""
         return False

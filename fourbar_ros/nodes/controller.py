@@ -25,6 +25,7 @@ from fourbar_ros.control.scalars import (
     MOMENTUM,
     momentum_scalars,
 )
+from fourbar_ros.device.steady import steady_ns
 from fourbar_ros.loop.pairing import Punctuality, StampPairs
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism
 from fourbar_ros.nodes.controller_services import ControllerServices
@@ -36,7 +37,6 @@ from fourbar_ros.nodes.messages import (
     RELIABLE,
     sensor_quality,
     stamp_of,
-    steady_ns,
     TABLE_FRAME,
 )
 from fourbar_ros.nodes.parameters import declare

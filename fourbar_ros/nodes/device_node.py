@@ -16,6 +16,7 @@
 
 from fourbar_ros.device import PaceError, Testbed, TestbedSettings
 from fourbar_ros.device.gate import DeviceState
+from fourbar_ros.device.steady import steady_ns
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.nodes.device_topics import DeviceTopics, LEVELS
@@ -27,7 +28,6 @@ from fourbar_ros.nodes.messages import (
     Recently,
     RELIABLE,
     stamp_of,
-    steady_ns,
     WARN,
 )
 from fourbar_ros.nodes.paces import realtime_pace

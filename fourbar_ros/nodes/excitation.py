@@ -22,7 +22,7 @@ from fourbar_ros.mechanism import FLYWHEEL_NAMES
 from fourbar_ros.nodes.environment import RosError
 from fourbar_ros.nodes.experiment import Experiment
 from fourbar_ros.nodes.messages import RELIABLE, stamp_of
-from fourbar_ros.nodes.runtime import go_first
+from fourbar_ros.nodes.priority import go_first
 import numpy as np
 from sensor_msgs.msg import JointState
 

@@ -17,10 +17,10 @@
 from fourbar_ros.device.prototype.parameters import bus_parameters, make_codec, open_bus
 from fourbar_ros.device.prototype.prototype import Prototype
 from fourbar_ros.device.prototype.safety import load_safety
+from fourbar_ros.device.steady import steady_ns
 from fourbar_ros.mechanism import load_mechanism
 from fourbar_ros.nodes import device_node
 from fourbar_ros.nodes.device_parameters import common_parameters
-from fourbar_ros.nodes.messages import steady_ns
 from fourbar_ros.nodes.parameters import Parameter
 from fourbar_ros.nodes.runtime import run_node
 

@@ -14,9 +14,8 @@
 
 """Quality of service, and messages that are made once and written in place."""
 
-import time
-
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from fourbar_ros.device.steady import steady_ns
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -37,16 +36,6 @@ LOG_PERIOD = 1.0
 RECENT = 10.0
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-
-
-def steady_ns():
-    """
-    Read the clock that nobody can set [ns].
-
-    The very one that timers run on (rcutils): Python's monotonic clock is disciplined by NTP and
-    would slowly slide past it.
-    """
-    return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
 
 
 def sensor_quality(node):

@@ -17,7 +17,7 @@
 import time
 
 from fourbar_ros.device import FastPace, LockstepPace, RealtimePace
-from fourbar_ros.nodes.messages import steady_ns
+from fourbar_ros.device.steady import steady_ns
 
 # Up to this delay every tick is caught up with; after longer ones real time leaves them out and
 # fast time slows down [ns].

@@ -15,10 +15,10 @@
 """The simulated air table as a node."""
 
 from fourbar_ros.device import Remedy
+from fourbar_ros.device.steady import steady_ns
 from fourbar_ros.nodes import device_node
 from fourbar_ros.nodes.device_parameters import common_parameters
 from fourbar_ros.nodes.ground_truth import GroundTruth
-from fourbar_ros.nodes.messages import steady_ns
 from fourbar_ros.nodes.paces import fast_pace, lockstep_pace, realtime_pace
 from fourbar_ros.nodes.parameters import Parameter
 from fourbar_ros.nodes.runtime import run_node

@@ -28,9 +28,9 @@ from fourbar_ros.device.prototype.emulator import (
 from fourbar_ros.device.prototype.firmware import FirmwareSettings
 from fourbar_ros.device.prototype.parameters import bus_parameters, make_codec, open_bus
 from fourbar_ros.device.prototype.serving import attend
+from fourbar_ros.device.steady import steady_ns
 from fourbar_ros.mechanism import LINK_NAMES
 from fourbar_ros.nodes.ground_truth import GroundTruth
-from fourbar_ros.nodes.messages import steady_ns
 from fourbar_ros.nodes.parameters import declare, Parameter
 from fourbar_ros.nodes.runtime import run_node
 from fourbar_ros.nodes.table_parameters import apply_faults, make_table, table_parameters

@@ -14,8 +14,8 @@
 
 """The services that only a simulated table has."""
 
+from fourbar_ros.device.steady import steady_ns
 from fourbar_ros.errors import FourbarError
-from fourbar_ros.nodes.messages import steady_ns
 from std_srvs.srv import SetBool, Trigger
 
 

@@ -21,7 +21,8 @@ from fourbar_ros.device import (
     ClockLimit,
     LockstepGuard,
 )
-from fourbar_ros.nodes.messages import RareLog, RELIABLE, steady_ns
+from fourbar_ros.device.steady import steady_ns
+from fourbar_ros.nodes.messages import RareLog, RELIABLE
 from rclpy.clock import Clock, ClockType
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import JointState

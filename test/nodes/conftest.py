@@ -21,7 +21,6 @@ from importlib.util import module_from_spec, spec_from_file_location
 import os
 from pathlib import Path
 import signal
-from socket import AF_INET, SOCK_DGRAM, socket
 import subprocess
 import sys
 import tempfile
@@ -29,6 +28,7 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from fourbar_ros.configuration import share_directory
+from fourbar_ros.device.prototype.parameters import free_addresses
 from fourbar_ros.loop.warm_up import warm_up
 from fourbar_ros.mechanism import FLYWHEEL_NAMES
 import pytest
@@ -105,10 +105,7 @@ def claimed_domain():
 
 def on_a_bus():
     """Return parameters with which a host and its links find each other, on free ports."""
-    with socket(AF_INET, SOCK_DGRAM) as host, socket(AF_INET, SOCK_DGRAM) as links:
-        for end in (host, links):
-            end.bind(('127.0.0.1', 0))
-        host, links = (f'127.0.0.1:{end.getsockname()[1]}' for end in (host, links))
+    host, links = free_addresses(2)
     return {name: {'bus.interface': 'fourbar_udp', 'bus.channel': own,
                    'bus.options': f'peers={other}'}
             for name, own, other in (

@@ -40,6 +40,7 @@ from fourbar_ros.device.prototype.prototype import Prototype
 from fourbar_ros.device.prototype.safety import load_safety
 from fourbar_ros.device.prototype.serving import attend
 from fourbar_ros.device.prototype.udp_bus import UdpBus
+from fourbar_ros.device.steady import steady_ns
 from fourbar_ros.mechanism import load_mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plant import InitialState, load_table, Plant
@@ -86,11 +87,6 @@ def run(progress: Progress, seconds: int = SECONDS) -> Result:
         links.join(START_UP_S)
         host.shutdown()
     return _result({**counts, **told}, round_trips, seconds)
-
-
-def steady_ns() -> int:
-    """Read the clock of both ends [ns]."""
-    return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
 
 
 def _address(bus: UdpBus) -> str:

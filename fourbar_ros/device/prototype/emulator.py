@@ -25,6 +25,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from fourbar_ros.device.pacing import RealtimePace
 from fourbar_ros.device.protocol import Drive, Samples
 from fourbar_ros.device.prototype.firmware import Firmware, FirmwareSettings
 from fourbar_ros.device.prototype.messages import (
@@ -33,12 +34,14 @@ from fourbar_ros.device.prototype.messages import (
     ClockReport,
     Codec,
     Command,
+    COUNTERS,
     Frame,
     FrameError,
     Heartbeat,
     Limits,
     MotorReport,
     Release,
+    SEQUENCES,
     Stop,
     Sync,
     ToHost,
@@ -55,8 +58,6 @@ LINKS = range(4)
 TURN = 256 * 2.0 * np.pi
 # Link time in reports starts over after this [us].
 WRAP_US = 10 * 2 ** 20
-# Samples and heartbeats are numbered modulo this; starts, and questions of the host, by that.
-SEQUENCES, BYTE = 16, 256
 # The time is told with every so many questions.
 CLOCK_EVERY = 16
 HEARTBEAT_NS = 50_000_000
@@ -129,10 +130,10 @@ class Emulator:
         self._clocks = clocks
         self._settings = firmware
         self._rng = rng
-        self._began_ns = self._next_ns = now_ns
-        self._shift_ns = stamp_ns - now_ns
+        self._began_ns, self._shift_ns = now_ns, stamp_ns - now_ns
+        self._pace = RealtimePace(stamp_ns, now_ns, table.period_ns, PATIENCE_NS)
         self._firmware = [Firmware(link, firmware) for link in LINKS]
-        self._boots = [int(boot) for boot in rng.integers(0, BYTE, 4)]
+        self._boots = [int(boot) for boot in rng.integers(0, COUNTERS, 4)]
         self._sequences = np.zeros((2, 4), dtype=int)
         self._torques, self._steps = np.zeros(4), 0
         self._beat_ns = now_ns
@@ -142,7 +143,7 @@ class Emulator:
     @property
     def next_ns(self) -> int:
         """When the table is due to move again [ns]."""
-        return self._next_ns
+        return self._pace.next_ns - self._shift_ns
 
     @property
     def firmware(self) -> Sequence[Firmware]:
@@ -166,7 +167,9 @@ class Emulator:
         self._firmware[link].voltage = 9.8 if kind == 'low_battery' else 12.0
         if kind == 'reboot':
             self._firmware[link] = Firmware(link, self._settings)
-            self._boots[link] = (self._boots[link] + 1 + int(self._rng.integers(0, 200))) % BYTE
+            # Another one for sure.
+            ahead = 1 + int(self._rng.integers(0, 200))
+            self._boots[link] = (self._boots[link] + ahead) % COUNTERS
 
     def advance(self, now_ns: int) -> list[Frame]:
         """
@@ -176,12 +179,8 @@ class Emulator:
         :returns: what the links say by themselves meanwhile.
         """
         frames: list[Frame] = []
-        if now_ns - self._next_ns > PATIENCE_NS:
-            periods = (now_ns - self._next_ns) // self.table.period_ns
-            self.counts['steps_left_out'] += periods
-            self._next_ns += periods * self.table.period_ns
-        while self._next_ns <= now_ns:
-            self._step(frames)
+        while (stamp_ns := self._pace.due(now_ns)) is not None:
+            self._step(stamp_ns, frames)
         if now_ns - self._beat_ns >= HEARTBEAT_NS:
             self._beat_ns = now_ns
             for link in self.links:
@@ -223,19 +222,19 @@ class Emulator:
                 firmware.load_limits(message)
         return frames
 
-    def _step(self, frames: list[Frame]) -> None:
-        """Move the table by one period."""
+    def _step(self, stamp_ns: int, frames: list[Frame]) -> None:
+        """Move the table up to a stamp."""
         drives = [firmware.drive() if link in self.links else (0.0, False, False)
                   for link, firmware in enumerate(self._firmware)]
         values, by_speed, powered = zip(*drives)
         samples = self.table.step(
-            self._next_ns + self._shift_ns,
-            Drive(np.array(values), np.array(by_speed), np.array(powered)))
+            stamp_ns, Drive(np.array(values), np.array(by_speed), np.array(powered)))
         self.samples = samples
         self._torques += samples.wheels.efforts
         self._steps += 1
         for link in self.links:
-            self._firmware[link].watch(float(samples.wheels.speeds[link]), self._next_ns)
+            self._firmware[link].watch(
+                float(samples.wheels.speeds[link]), stamp_ns - self._shift_ns)
         for reading in samples.links:
             for index, name in enumerate(reading.names):
                 link = LINK_NAMES.index(name)
@@ -243,7 +242,6 @@ class Emulator:
                     rate = float(reading.rates[index]) if len(reading.rates) else None
                     self._tell_angle(link, reading.stamp_ns - self._shift_ns,
                                      float(reading.angles[index]), rate, frames)
-        self._next_ns += self.table.period_ns
 
     def _tell_angle(self, link: int, measured_ns: int, angle: float, rate: float | None,
                     frames: list[Frame]) -> None:

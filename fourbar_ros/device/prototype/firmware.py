@@ -21,13 +21,10 @@ from collections.abc import Set
 from dataclasses import dataclass
 from math import copysign
 
-from fourbar_ros.device.prototype.messages import Command, Limits, LinkState
+from fourbar_ros.device.prototype.messages import Command, COUNTERS, Limits, LinkState
 
 # A wheel beyond its speed limit by this factor is a fault of its own [1].
 OVERSPEED = 1.2
-
-# Sequences of commands start over after so many.
-SEQUENCES = 256
 
 
 @dataclass(frozen=True)
@@ -102,8 +99,8 @@ class Firmware:
         """Take a command that is for this link, unless it came before."""
         last = self._command
         if last is not None:
-            ahead = (command.sequence - last.sequence) % SEQUENCES
-            if ahead == 0 or ahead > SEQUENCES // 2:
+            ahead = (command.sequence - last.sequence) % COUNTERS
+            if ahead == 0 or ahead > COUNTERS // 2:
                 # After a silence nobody knows how many were lost; but nothing that would drive a
                 # wheel begins a new count.
                 silent = now_ns - self._command_ns > self._settings.command_timeout_s * 1e9

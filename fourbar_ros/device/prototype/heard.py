@@ -23,14 +23,13 @@ from fourbar_ros.device.prototype.clock import LinkClock
 from fourbar_ros.device.prototype.messages import (
     AngleReport,
     ClockReport,
+    COUNTERS,
     Heartbeat,
     LinkState,
     MotorReport,
+    SEQUENCES,
     WheelReport,
 )
-
-# Of a `Sync`, its counter; of a command, its sequence; of a sample or a heartbeat, its sequence.
-COUNTERS, SEQUENCES = 256, 16
 
 # Stamps may be so much after the arrival of what they are of, for the clock is an estimate [ns].
 AHEAD_NS = 2_000_000

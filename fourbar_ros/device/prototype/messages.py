@@ -67,6 +67,10 @@ class LinkState(Enum):
     """By itself: no torque until the cause has gone, and it is disarmed and armed again."""
 
 
+COUNTERS, SEQUENCES = 256, 16
+"""Counters of a `Sync`, sequences of commands and numbers of starts begin again after so many;
+sequences of samples and heartbeats after fewer."""
+
 LINK_FAULTS = ('driver', 'encoder', 'angle_sensor', 'overspeed', 'overtemperature',
                'undervoltage', 'no_limits')
 """What may be wrong with a link, in the order of the bits; `no_limits`: none were loaded."""

@@ -17,6 +17,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
+import socket
 from typing import Any
 
 from fourbar_ros.device.prototype.messages import Codec
@@ -66,3 +68,13 @@ def make_codec(values: Mapping[str, Any], mechanism: Mechanism) -> Codec:
             values['dbc'], torque_constants=mechanism.motor_torque_constants.tolist())
     from fourbar_ros.device.prototype.dbc_codec import DbcCodec
     return DbcCodec(values['dbc'])
+
+
+def free_addresses(count: int) -> list[str]:
+    """Find addresses on this machine, as channels, that nobody uses now."""
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                   for _ in range(count)]
+        for one in sockets:
+            one.bind(('127.0.0.1', 0))
+        return [f'127.0.0.1:{one.getsockname()[1]}' for one in sockets]

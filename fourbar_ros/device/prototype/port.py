@@ -26,11 +26,12 @@ from importlib import import_module
 from inspect import signature
 import logging
 import re
-from time import clock_gettime_ns, CLOCK_MONOTONIC_RAW, monotonic, time
+from time import monotonic, time
 from types import TracebackType
 from typing import Any, TYPE_CHECKING
 
 from fourbar_ros.device.prototype.messages import BusError, Frame
+from fourbar_ros.device.steady import steady_ns
 
 if TYPE_CHECKING:
     import can
@@ -151,7 +152,7 @@ class Port:
                 self.dropped += 1
             if deadline:
                 remaining_s = max(0.0, deadline - monotonic())
-        now_ns, age_s = clock_gettime_ns(CLOCK_MONOTONIC_RAW), time() - message.timestamp
+        now_ns, age_s = steady_ns(), time() - message.timestamp
         if age_s < 0.0 or age_s > OWN_CLOCK_S and not self._system_time:
             age_s = 0.0
         self.received += 1

@@ -36,13 +36,14 @@ from fourbar_ros.device.protocol import (
     Samples,
     WheelSample,
 )
-from fourbar_ros.device.prototype.heard import COUNTERS, HeardLink
+from fourbar_ros.device.prototype.heard import HeardLink
 from fourbar_ros.device.prototype.messages import (
     AngleReport,
     BusError,
     ClockReport,
     Codec,
     Command,
+    COUNTERS,
     Frame,
     FrameError,
     Heartbeat,
