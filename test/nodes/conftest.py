@@ -51,6 +51,8 @@ COMMAND_TIMEOUT_S = 1.0
 # A first answer that takes longer was lost on its way.
 ASK_AGAIN_S = 3.0
 DOMAINS = range(1, 102)
+# Where a process was killed: what it held in shared memory may be locked for ever.
+spoiled_domains = set()
 
 DEEP = QoSProfile(depth=5000)
 COMMAND = QoSProfile(depth=10)
@@ -82,7 +84,7 @@ def values_of(status):
 @contextmanager
 def claimed_domain():
     """Hold a ROS domain that no other test run on this machine uses, under a lock file."""
-    for number in DOMAINS:
+    for number in (number for number in DOMAINS if number not in spoiled_domains):
         path = Path(tempfile.gettempdir(), f'fourbar_ros_domain_{number}.lock')
         try:
             lock = path.open('w')
@@ -506,6 +508,8 @@ def shared_memory(domain):
     """Check, when everything has ended, that it left nothing in /dev/shm."""
     shared_memory = SharedMemory()
     yield shared_memory
+    if shared_memory.spoiled:
+        spoiled_domains.add(domain)
     shared_memory.check()
 
 
