@@ -55,6 +55,8 @@ class Parameter:
         kind = type(self.default)
         if kind is str and value is False:
             value = 'off'   # which is how YAML reads that word
+        if kind is str and type(value) is int:
+            value = str(value)   # as the channel of some bus adapters
         if kind is float and type(value) is int:
             value = float(value)
         if type(value) is not kind:

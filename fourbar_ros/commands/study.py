@@ -22,12 +22,12 @@ import json
 from pathlib import Path
 import sys
 
-from fourbar_ros.analysis.studies import load_study, STUDIES
+from fourbar_ros.analysis.studies import load_study, OPTIONS, STUDIES
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    known = '\n'.join(f'  {name:<12}{text}' for name, text in STUDIES.items())
+    known = '\n'.join(f'  {name:<14}{study.summary}' for name, study in STUDIES.items())
     parser.epilog = (f'studies:\n{known}\n\n'
                      'Exits with 0 when every check is kept, with 1 when one is missed.')
     parser.add_argument('name', metavar='NAME', help='which study')
@@ -37,14 +37,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--json', metavar='FILE', type=Path,
         help='checks and numbers, units in their names (also in FOLDER as NAME.json)')
-    drawn = parser.add_argument_group('studies that draw at random')
-    drawn.add_argument('--runs', metavar='N', type=int,
-                       help='runs of each kind (default as many as the limits are made for: '
-                            '100, of crossing 300)')
-    drawn.add_argument('--seed', metavar='S', type=int,
-                       help='of the first run of each kind, the others follow it (default 0)')
-    drawn.add_argument('--jobs', metavar='N', type=int,
-                       help='processes, which change nothing but the time (default all cores)')
+    some = parser.add_argument_group('what some studies take')
+    for name, option in OPTIONS.items():
+        takes = ', '.join(study for study, entry in STUDIES.items() if name in entry.options)
+        meaning = f'{option.meaning}; {takes}'
+        if option.positional:
+            parser.add_argument(name, metavar=option.metavar, nargs='?', type=option.kind,
+                                help=meaning)
+        else:
+            some.add_argument(f'--{name}', metavar=option.metavar, type=option.kind, help=meaning)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -54,11 +55,10 @@ def run(args: argparse.Namespace) -> int:
     from fourbar_ros.commands.progress import show_progress
     from fourbar_ros.mechanism.compiled import announced
 
-    sample = {name: value for name in ('runs', 'seed', 'jobs')
-              if (value := getattr(args, name)) is not None}
-    study = load_study(args.name, **sample)
-    # Before the work, not after it.
     folder = args.output or Path(f'study_{args.name}')
+    study = load_study(args.name, folder, **{
+        name: value for name in OPTIONS if (value := getattr(args, name)) is not None})
+    # Before the work, not after it.
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -16,7 +16,9 @@
 Studies that can be run again, one module each.
 
 A study is a module with `run(progress)` that returns a `Result`; one that draws at random takes a
-`Sample` as well. It reads no files but presets and writes none: the command does.
+`Sample` as well, and others what their entry in `STUDIES` lists. It reads no files but presets and
+those that it is given, and writes none: the command does. Only one that can be resumed keeps what is
+finished in its folder.
 """
 
 from __future__ import annotations
@@ -26,20 +28,64 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 import os
+from pathlib import Path
 from typing import Any
 
 from fourbar_ros.analysis.checks import Check
 from fourbar_ros.analysis.progress import Progress
 from fourbar_ros.errors import FourbarError
 
-STUDIES = {
-    'validation': 'section 3: our motions beside other engines and reference motions',
-    'consistency': 'the estimator in closed loops at random: NEES, NIS, errors beside their bound',
-    'crossing': 'change points with four wheels and with two: crossing, parking, turning there',
-    'bus': 'ten minutes of the prototype on a bus over loopback: lost frames, round trips',
+
+@dataclass(frozen=True)
+class Study:
+    """
+    What there is to know of a study before its module is imported.
+
+    :param summary: one line.
+    :param options: names of `OPTIONS` that it takes. With `seed` it is given a `sample`, of which
+        these are parts; the others it is given by name.
+    :param runs: of each kind, unless told.
+    :param resumes: whether it is given a `folder`, where it keeps what is finished.
+    """
+
+    summary: str
+    options: tuple[str, ...] = ()
+    runs: int = 100
+    resumes: bool = False
+
+
+@dataclass(frozen=True)
+class Option:
+    """
+    What a study can be told.
+
+    :param metavar, meaning: for the help.
+    :param kind: makes it of what was typed.
+    :param positional: given without its name; the study cannot do without it.
+    """
+
+    metavar: str
+    meaning: str
+    kind: Callable[[str], Any] = str
+    positional: bool = False
+
+
+OPTIONS = {
+    'runs': Option('N', 'runs of each kind (default as many as the limits are made for: 100, of '
+                   'crossing 300)', int),
+    'seed': Option('S', 'of the first run of each kind, the others follow it (default 0)', int),
+    'jobs': Option('N', 'processes, which change nothing but the time (default all cores)', int),
 }
-RANDOM = {'consistency': 100, 'crossing': 300}
-"""Those that draw at random, and how many runs of each kind unless told."""
+_DRAWN = ('runs', 'seed', 'jobs')
+
+STUDIES = {
+    'validation': Study('section 3: our motions beside other engines and reference motions'),
+    'consistency': Study('the estimator in closed loops at random: NEES, NIS, errors beside their '
+                         'bound', _DRAWN),
+    'crossing': Study('change points with four wheels and with two: crossing, parking, turning '
+                      'there', _DRAWN, runs=300),
+    'bus': Study('ten minutes of the prototype on a bus over loopback: lost frames, round trips'),
+}
 
 LARGEST_SEED = 2 ** 63 - 1
 MOST_RUNS = 1_000_000
@@ -100,22 +146,36 @@ class Result:
     skipped: Sequence[str] = ()
 
 
-def load_study(name: str, **sample: int) -> Callable[[Progress], Result]:
+def load_study(name: str, folder: Path | None = None, **given: Any
+               ) -> Callable[[Progress], Result]:
     """
     Return the function that runs a study.
 
-    :param sample: what is given of a `Sample`.
-    :raises StudyError: there is no study of this name, or it does not draw that.
+    :param folder: where one that can be resumed keeps what is finished.
+    :param given: options by name.
+    :raises StudyError: there is no study of this name, it does not take that, or needs more.
     """
-    if name not in STUDIES:
+    study = STUDIES.get(name)
+    if study is None:
         raise StudyError(f'no study {name!r} (known are {", ".join(STUDIES)})')
-    if sample and name not in RANDOM:
-        raise StudyError(f'study {name} draws nothing at random: it takes no '
-                         + ', '.join(f'--{option}' for option in sample))
-    drawn = {'sample': Sample(**{'runs': RANDOM[name], **sample})} if name in RANDOM else {}
+    if unknown := [written(option) for option in given if option not in study.options]:
+        raise StudyError(f'study {name} takes no {", ".join(unknown)}')
+    if missing := [written(option) for option in study.options
+                   if OPTIONS[option].positional and option not in given]:
+        raise StudyError(f'study {name} needs {", ".join(missing)}')
+    if 'seed' in study.options:
+        drawn = {option: given.pop(option) for option in _DRAWN if option in given}
+        given['sample'] = Sample(**{'runs': study.runs, **drawn})
+    if study.resumes:
+        given['folder'] = folder
     try:
         run: Callable[..., Result] = import_module(f'{__name__}.{name}').run
     except ImportError as error:
         raise StudyError(
             f'{error.name} is missing: pip install fourbar_ros[analysis,hardware]') from None
-    return partial(run, **drawn)
+    return partial(run, **given)
+
+
+def written(option: str) -> str:
+    """Return an option as it is written on the command line."""
+    return OPTIONS[option].metavar if OPTIONS[option].positional else f'--{option}'

@@ -89,7 +89,12 @@ class HeardLink:
     @property
     def complete(self) -> bool:
         """Whether wheel and motor have answered."""
-        return self._answered is not None and self._motor_answered
+        return self.missing == 0
+
+    @property
+    def missing(self) -> int:
+        """How many of the two answers are not there yet, the wheel's and the motor's."""
+        return (self._answered is None) + (not self._motor_answered)
 
     def take_wheel(self, report: WheelReport, counter: int, sent_ns: int, arrival_ns: int) -> None:
         """

@@ -150,6 +150,8 @@ class Prototype(Device):
         self._sent_ns = [0] * COUNTERS
         self._findings: tuple[Finding, ...] = ()
         self._armed_boots = [0, 0, 0, 0]
+        # Whether a finding ended the driving and something is still wrong: it may get worse.
+        self._watched = False
         self._bad = 0
         self._bad_since_ns = self._since_ns
 
@@ -188,6 +190,8 @@ class Prototype(Device):
     def gate_changed(self, state: DeviceState) -> None:
         """Stop or release the links at once, and remember how they are when they are armed."""
         was, self._state = self._state, state
+        self._watched = (was, state) == (DeviceState.ARMED, DeviceState.DISARMED) and bool(
+            self._findings)
         if state is DeviceState.ARMED:
             self._since_ns = self._steady_ns()
             self._armed_boots = [link.boots for link in self.links]
@@ -422,10 +426,14 @@ class Prototype(Device):
                 'bad_frames', 'bus', rate > self._safety.table['bad_frames'].limit, rate,
                 '{0:.0f} frames a second are no good, limit {1:g}', now_ns)
             self._bad, self._bad_since_ns = bad, now_ns
-        armed = self._state is DeviceState.ARMED
-        self._findings = tuple(
-            finding for finding in self._safety.findings()
-            if finding.reaction is not Reaction.WARN) if armed else ()
+        found = tuple(finding for finding in self._safety.findings()
+                      if finding.reaction is not Reaction.WARN)
+        self._watched &= bool(found)
+        if self._watched:
+            found = tuple(finding for finding in found if finding.reaction is Reaction.STOP)
+        elif self._state is not DeviceState.ARMED:
+            found = ()
+        self._findings = found
 
     def _look_at(self, index: int, name: str, link: HeardLink, now_ns: int) -> None:
         table, look = self._safety.table, self._safety.look

@@ -103,6 +103,43 @@ def test_heartbeat_lost_while_armed_is_an_emergency_stop(driven) -> None:
     assert_coasting(driven)
 
 
+def test_link_that_stays_silent_is_disarmed_first_and_then_an_emergency_stop(driven) -> None:
+    driven.wire.emulators[0].trouble('link_b', 'silent')
+    assert wait(driven, lambda: not driven.testbed.gate.armed, 0.07) > 0.04
+    assert driven.testbed.gate.state is DeviceState.DISARMED
+    after = wait(
+        driven, lambda: driven.testbed.gate.state is DeviceState.EMERGENCY_STOP, 0.6)
+    assert after > 0.3
+    assert 'link_b: no heartbeat for' in driven.testbed.gate.reason
+    driven.wire.emulators[0].trouble('link_b', '')
+    driven.run(1.5)
+    armed, reason = driven.arm()
+    assert not armed
+    assert 'no heartbeat for' in reason
+    driven.testbed.reset()
+    driven.run(0.1)
+    assert driven.arm() == (True, 'armed')
+
+
+def test_link_that_falls_silent_while_nobody_drives_stops_nothing(driven) -> None:
+    driven.testbed.disarm('test')
+    driven.run(0.1)
+    driven.wire.emulators[0].trouble('link_b', 'silent')
+    driven.run(1.5)
+    assert driven.testbed.gate.state is DeviceState.DISARMED
+
+
+def test_link_that_is_heard_again_at_once_is_only_disarmed(driven) -> None:
+    driven.wire.emulators[0].trouble('link_b', 'silent')
+    wait(driven, lambda: not driven.testbed.gate.armed, 0.07)
+    driven.wire.emulators[0].trouble('link_b', '')
+    driven.run(1.0)
+    # What comes later is of another time.
+    driven.wire.emulators[0].trouble('link_b', 'silent')
+    driven.run(1.0)
+    assert driven.testbed.gate.state is DeviceState.DISARMED
+
+
 def test_diagnosis_tells_all_of_a_link_the_worst_first(driven) -> None:
     driven.wire.emulators[0].trouble('link_c', 'hot')
     driven.run(1.5)
@@ -126,8 +163,8 @@ def test_bus_that_drops_out_leaves_wheels_coasting_until_somebody_arms(driven, s
     # Commands come at every tick, and nothing moves for them.
     assert all(samples.complete for samples in driven.samples[-50:])
     assert_coasting(driven)
-    if driven.testbed.gate.state is DeviceState.EMERGENCY_STOP:
-        driven.testbed.reset()
+    assert driven.testbed.gate.state is DeviceState.EMERGENCY_STOP
+    driven.testbed.reset()
     driven.run(0.1)
     assert driven.arm() == (True, 'armed')
     driven.run(0.2)
