@@ -17,8 +17,8 @@ Studies that can be run again, one module each.
 
 A study is a module with `run(progress)` that returns a `Result`; one that draws at random takes a
 `Sample` as well, and others what their entry in `STUDIES` lists. It reads no files but presets and
-those that it is given, and writes none: the command does. Only one that can be resumed keeps what is
-finished in its folder.
+those that it is given, and writes none: the command does. Only one that can be resumed keeps what
+is finished in its folder.
 """
 
 from __future__ import annotations
@@ -84,6 +84,7 @@ STUDIES = {
                          'bound', _DRAWN),
     'crossing': Study('change points with four wheels and with two: crossing, parking, turning '
                       'there', _DRAWN, runs=300),
+    'energy': Study('section 4, Fig. 4: what four wheels save over two, and when not'),
     'bus': Study('ten minutes of the prototype on a bus over loopback: lost frames, round trips'),
 }
 
