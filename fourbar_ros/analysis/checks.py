@@ -67,7 +67,7 @@ def print_checks(checks: Sequence[Check], file: TextIO | None = None) -> None:
 
     :param file: default standard output.
     """
-    rows = [(check.name, f'{check.value:.4g}', check.unit, check.relation, _limit_text(check),
+    rows = [(check.name, f'{check.value:.6g}', check.unit, check.relation, _limit_text(check),
              'ok' if check.passed else 'MISSED') for check in checks]
     widths = [max(map(len, column)) for column in zip(*rows)]
     for row in rows:
@@ -104,5 +104,5 @@ def _check(name: str, value: float, unit: str, limit: float | tuple[float, float
 
 def _limit_text(check: Check) -> str:
     if isinstance(check.limit, tuple):
-        return f'[{check.limit[0]:.4g}, {check.limit[1]:.4g}]'
-    return f'{check.limit:.4g}'
+        return f'[{check.limit[0]:.6g}, {check.limit[1]:.6g}]'
+    return f'{check.limit:.6g}'

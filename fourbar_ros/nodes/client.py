@@ -62,18 +62,20 @@ class TestbedClient:
         :raises KeyboardInterrupt: a signal came.
         """
         end = time.monotonic() + seconds
-        while not condition():
-            if self.runtime.stopping:
-                raise KeyboardInterrupt
+        while True:
+            # First: what a callback has failed at may be all that the condition waits for.
             if self.runtime.failure is not None:
                 raise self.runtime.failure
+            if condition():
+                return True
+            if self.runtime.stopping:
+                raise KeyboardInterrupt
             remaining = end - time.monotonic()
             if remaining <= 0.0:
                 if missing is None:
                     return False
                 raise RosError(f'{missing} within {seconds:g} s')
             self.runtime.executor.spin_once(timeout_sec=min(0.05, remaining))
-        return True
 
     def follow(self, *topics):
         """Keep the newest status of `device_status` or `controller_status` in `statuses`."""

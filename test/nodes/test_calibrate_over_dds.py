@@ -113,6 +113,16 @@ def test_interrupt_leaves_the_wheels_without_torque(start, plant):
     check_left_without_torque(plant)
 
 
+def test_linkage_that_comes_near_a_change_point_ends_it_and_leaves_no_recording(
+        start, plant, tmp_path):
+    bag = tmp_path / 'bag'
+    process = start('links', '--torque', '0.05', '--duration', '12', '--yes', '--record', str(bag))
+    assert process.end() == 2
+    assert 'deg of a line, limit 10.0 deg: begin farther' in process.stderr.splitlines()[-1]
+    assert not bag.exists()
+    check_left_without_torque(plant)
+
+
 def test_nobody_else_may_drive(start, plant):
     plant.drive([0.0] * 4)
     process = start(*WHEELS)

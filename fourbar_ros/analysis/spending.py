@@ -1,0 +1,148 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What a motion costs by how the wheels share it.
+
+Wheel energy of paper eq. 7, the sum of eq. 9 as it is printed, the work that motors do, and the
+heat in their windings; along a planned way, by inverse dynamics, without friction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from fourbar_ros.control.branch import branch_at, LINKS_ALONE
+from fourbar_ros.control.feasibility import wheel_loads
+from fourbar_ros.control.reference import Way
+from fourbar_ros.control.setpoint import angles_along
+from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.dynamics import gamma_matrix
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+
+# Instants at which a way is looked at. Sums by the trapezoid are good to 1e-8 of their size.
+SAMPLES = 4001
+
+# Of the largest demand, what wheels may leave unmet.
+UNMET = 1e-9
+
+
+class SpendingError(FourbarError):
+    """A motion that the wheels cannot make."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spending:
+    """
+    Wheels along a motion.
+
+    :param mechanism: the linkage.
+    :param times: (n,) [s].
+    :param angles: (n, 4) of the links [rad].
+    :param link_rates: (n, 4) [rad/s].
+    :param torques: (n, 4) of the motors [N m].
+    :param speeds: (n, 4) of the wheels, absolute [rad/s].
+    """
+
+    mechanism: Mechanism
+    times: Array
+    angles: Array
+    link_rates: Array
+    torques: Array
+    speeds: Array
+
+    @cached_property
+    def energy(self) -> Array:
+        """Kinetic energy of the wheels, paper eq. 7 (n,) [J]."""
+        found: Array = 0.5 * (self.speeds ** 2) @ self.mechanism.flywheel_inertias
+        return found
+
+    @cached_property
+    def eq9(self) -> Array:
+        """Paper eq. 9 as printed, the integral of twice the kinetic energy (n,) [J s]."""
+        return self._summed(2.0 * self.energy)
+
+    @cached_property
+    def work(self) -> Array:
+        """Work of the motors so far, without regard to sign (n,) [J]."""
+        return self._summed(np.abs(self.torques * self.motor_speeds).sum(axis=1))
+
+    @cached_property
+    def copper(self) -> Array:
+        """Heat in the windings so far, 0 where none are described (n,) [J]."""
+        currents = self.torques / self.mechanism.motor_torque_constants
+        return self._summed((currents ** 2) @ self.mechanism.motor_resistances)
+
+    @property
+    def motor_speeds(self) -> Array:
+        """Speeds of the wheels relative to their links (n, 4) [rad/s]."""
+        return self.speeds - self.link_rates
+
+    def totals(self) -> dict[str, Any]:
+        """Return the numbers that stand for the whole motion, for JSON."""
+        return {
+            'peak_speed_rad_s': float(np.abs(self.speeds).max()),
+            'peak_motor_speed_rad_s': float(np.abs(self.motor_speeds).max()),
+            'peak_torque_n_m': float(np.abs(self.torques).max()),
+            'peak_energy_j': float(self.energy.max()),
+            'eq9_j_s': float(self.eq9[-1]), 'work_j': float(self.work[-1]),
+            'copper_j': float(self.copper[-1]),
+            'peak_speeds_rad_s': np.abs(self.speeds).max(axis=0).tolist(),
+            'end_speeds_rad_s': self.speeds[-1].tolist()}
+
+    def _summed(self, rates: Array) -> Array:
+        found: Array = cumulative_trapezoid(rates, self.times, initial=0.0)
+        return found
+
+
+def spend(mechanism: Mechanism, way: Way, present: Array, mobilities: Array,
+          speeds: Array | None = None) -> Spending:
+    """
+    Work out what a motion takes.
+
+    :param present: (4,) link angles where it begins, which tell the branch [rad].
+    :param mobilities: V (4,): wheels share for the least sum of `tau_i^2 / V_i`, see
+        `control.allocation.mobilities`.
+    :param speeds: (4,) absolute speeds of the wheels at the begin, default 0 [rad/s].
+    :raises ClosureError: the loop cannot close on the way.
+    :raises SpendingError: the wheels that may be used cannot meet the demand.
+    """
+    times = way.instants(SAMPLES)
+    states = way.sample(times)
+    branch = branch_at(mechanism, present)
+    angles = angles_along(mechanism, states[:, 0], present, branch)
+    twins = LINKS_ALONE if branch is None else branch.twins
+    torques, gained, unmet = wheel_loads(
+        times, angles, states[:, 1:], branch is not None, twins,
+        np.asarray(mobilities, dtype=float), np.array([mechanism.constants]))
+    if not unmet <= UNMET:
+        raise SpendingError(f'these wheels leave {100.0 * unmet:.3g} % of the torque unmet')
+    axes = states[:, 1]
+    link_rates = np.empty((len(times), 4))
+    if branch is not None:
+        for axis in range(2):
+            link_rates[:, twins[axis]] = link_rates[:, twins[axis + 2]] = axes[:, axis]
+    else:
+        link_rates[:, :2] = axes
+        for row, (four, rates) in enumerate(zip(angles, axes)):
+            link_rates[row, 2:] = gamma_matrix(four, mechanism.link_lengths) @ rates
+    begin = np.zeros(4) if speeds is None else speeds
+    # What a wheel gains is relative to its link.
+    return Spending(mechanism, times, angles, link_rates, torques,
+                    begin + gained + link_rates - link_rates[0])
