@@ -22,6 +22,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 import contextlib
 from multiprocessing import get_context
+import os
 import signal
 import threading
 from typing import TypeVar
@@ -30,6 +31,10 @@ from fourbar_ros.errors import FourbarError
 
 _Item = TypeVar('_Item')
 _Found = TypeVar('_Found')
+
+
+# What tells the usual libraries of linear algebra how many threads to take.
+THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
 
 class CampaignError(FourbarError):
@@ -56,7 +61,7 @@ def in_processes(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: 
     # Not by fork: whoever calls may have threads.
     pool = ProcessPoolExecutor(min(jobs, len(items)), mp_context=get_context('spawn'))
     try:
-        with _interrupts_ignored():
+        with _interrupts_ignored(), _one_thread_each():
             waiting = deque(pool.submit(work, item) for item in items)
         while waiting:
             yield waiting.popleft().result()
@@ -78,3 +83,16 @@ def _interrupts_ignored() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Let linear algebra take one thread in the processes started here: they share the cores."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update({name: value or '1' for name, value in before.items()})
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]

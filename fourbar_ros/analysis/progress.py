@@ -20,3 +20,10 @@ from typing import Any
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 """Wraps an iterable that takes time, given also its length."""
+
+
+def remark(shown: Iterable[Any], text: str) -> None:
+    """Say something beside the progress, where it is shown."""
+    say = getattr(shown, 'set_postfix_str', None)
+    if say is not None:
+        say(text)

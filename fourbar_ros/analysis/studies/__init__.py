@@ -85,6 +85,8 @@ STUDIES = {
     'crossing': Study('change points with four wheels and with two: crossing, parking, turning '
                       'there', _DRAWN, runs=300),
     'energy': Study('section 4, Fig. 4: what four wheels save over two, and when not'),
+    'inertia': Study('section 4, Fig. 5: a search for wheel inertias, beside the closed form',
+                     ('seed', 'jobs'), resumes=True),
     'bus': Study('ten minutes of the prototype on a bus over loopback: lost frames, round trips'),
 }
 
