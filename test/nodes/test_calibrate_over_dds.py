@@ -20,6 +20,8 @@ import signal
 from fourbar_ros.mechanism import load_mechanism
 import numpy as np
 import pytest
+from rcl_interfaces.msg import Parameter, ParameterType
+from rcl_interfaces.srv import SetParameters
 import yaml
 
 pytestmark = pytest.mark.node
@@ -115,8 +117,19 @@ def test_interrupt_leaves_the_wheels_without_torque(start, plant):
 
 def test_linkage_that_comes_near_a_change_point_ends_it_and_leaves_no_recording(
         start, plant, tmp_path):
-    bag = tmp_path / 'bag'
-    process = start('links', '--torque', '0.05', '--duration', '12', '--yes', '--record', str(bag))
+    bag, parameter = tmp_path / 'bag', Parameter(name='initial.link_b')
+    parameter.value.type = ParameterType.PARAMETER_DOUBLE
+    # Where this reset takes it, and those of other tests.
+    for angle in (0.22, float(np.pi / 3.0)):
+        parameter.value.double_value = angle
+        result, = plant.call(SetParameters, 'plant/set_parameters',
+                             SetParameters.Request(parameters=[parameter])).results
+        assert result.successful
+        if angle == 0.22:
+            assert plant.trigger('sim/reset').success
+    plant.follow('flywheel_command')
+    plant.catch_up()
+    process = start('links', '--yes', '--record', str(bag))
     assert process.end() == 2
     assert 'deg of a line, limit 10.0 deg: begin farther' in process.stderr.splitlines()[-1]
     assert not bag.exists()
