@@ -16,7 +16,8 @@
 What a motion costs by how the wheels share it.
 
 Wheel energy of paper eq. 7, the sum of eq. 9 as it is printed, the work that motors do, and the
-heat in their windings; along a planned way, by inverse dynamics, without friction.
+heat in their windings; along a planned way, by inverse dynamics, with the friction of a table or
+without.
 """
 
 from __future__ import annotations
@@ -33,6 +34,10 @@ from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix
+from fourbar_ros.mechanism.forces import forces_along
+from fourbar_ros.plant import Table
+from fourbar_ros.plant.bearings import bearing_torque, drives_of
+from fourbar_ros.plant.table import surroundings_of
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
@@ -56,8 +61,9 @@ class Spending:
     :param times: (n,) [s].
     :param angles: (n, 4) of the links [rad].
     :param link_rates: (n, 4) [rad/s].
-    :param torques: (n, 4) of the motors [N m].
+    :param torques: (n, 4) that motors and bearings give the wheels together [N m].
     :param speeds: (n, 4) of the wheels, absolute [rad/s].
+    :param bearings: (n, 4) friction of the bearings, which the motors overcome [N m].
     """
 
     mechanism: Mechanism
@@ -66,6 +72,7 @@ class Spending:
     link_rates: Array
     torques: Array
     speeds: Array
+    bearings: Array
 
     @cached_property
     def energy(self) -> Array:
@@ -81,13 +88,30 @@ class Spending:
     @cached_property
     def work(self) -> Array:
         """Work of the motors so far, without regard to sign (n,) [J]."""
-        return self._summed(np.abs(self.torques * self.motor_speeds).sum(axis=1))
+        return self._summed(np.abs(self.motor_torques * self.motor_speeds).sum(axis=1))
 
     @cached_property
     def copper(self) -> Array:
         """Heat in the windings so far, 0 where none are described (n,) [J]."""
-        currents = self.torques / self.mechanism.motor_torque_constants
-        return self._summed((currents ** 2) @ self.mechanism.motor_resistances)
+        return self._summed((self.currents ** 2) @ self.mechanism.motor_resistances)
+
+    @cached_property
+    def drawn(self) -> Array:
+        """Energy taken from the supplies so far, what braking motors give back lost (n,) [J]."""
+        power = (self.motor_torques * self.motor_speeds
+                 + self.currents ** 2 * self.mechanism.motor_resistances)
+        return self._summed(np.maximum(power, 0.0).sum(axis=1))
+
+    @property
+    def motor_torques(self) -> Array:
+        """Torques of the motors, bearings included (n, 4) [N m]."""
+        return self.torques + self.bearings
+
+    @property
+    def currents(self) -> Array:
+        """Currents in the windings, 0 where none are described (n, 4) [A]."""
+        found: Array = self.motor_torques / self.mechanism.motor_torque_constants
+        return found
 
     @property
     def motor_speeds(self) -> Array:
@@ -99,10 +123,11 @@ class Spending:
         return {
             'peak_speed_rad_s': float(np.abs(self.speeds).max()),
             'peak_motor_speed_rad_s': float(np.abs(self.motor_speeds).max()),
-            'peak_torque_n_m': float(np.abs(self.torques).max()),
+            'peak_torque_n_m': float(np.abs(self.motor_torques).max()),
+            'peak_power_w': float(np.abs(self.motor_torques * self.motor_speeds).max()),
             'peak_energy_j': float(self.energy.max()),
             'eq9_j_s': float(self.eq9[-1]), 'work_j': float(self.work[-1]),
-            'copper_j': float(self.copper[-1]),
+            'copper_j': float(self.copper[-1]), 'drawn_j': float(self.drawn[-1]),
             'peak_speeds_rad_s': np.abs(self.speeds).max(axis=0).tolist(),
             'end_speeds_rad_s': self.speeds[-1].tolist()}
 
@@ -112,7 +137,8 @@ class Spending:
 
 
 def spend(mechanism: Mechanism, way: Way, present: Array, mobilities: Array,
-          speeds: Array | None = None) -> Spending:
+          speeds: Array | None = None, table: Table | None = None, samples: int = SAMPLES
+          ) -> Spending:
     """
     Work out what a motion takes.
 
@@ -120,29 +146,44 @@ def spend(mechanism: Mechanism, way: Way, present: Array, mobilities: Array,
     :param mobilities: V (4,): wheels share for the least sum of `tau_i^2 / V_i`, see
         `control.allocation.mobilities`.
     :param speeds: (4,) absolute speeds of the wheels at the begin, default 0 [rad/s].
+    :param table: whose friction and drag the wheels work against, default none.
+    :param samples: instants to look at.
     :raises ClosureError: the loop cannot close on the way.
     :raises SpendingError: the wheels that may be used cannot meet the demand.
     """
-    times = way.instants(SAMPLES)
+    times = way.instants(samples)
     states = way.sample(times)
     branch = branch_at(mechanism, present)
     angles = angles_along(mechanism, states[:, 0], present, branch)
     twins = LINKS_ALONE if branch is None else branch.twins
+    constants = np.array([mechanism.constants])
+    metric = np.asarray(mobilities, dtype=float)
     torques, gained, unmet = wheel_loads(
-        times, angles, states[:, 1:], branch is not None, twins,
-        np.asarray(mobilities, dtype=float), np.array([mechanism.constants]))
+        times, angles, states[:, 1:], branch is not None, twins, metric, constants)
     if not unmet <= UNMET:
         raise SpendingError(f'these wheels leave {100.0 * unmet:.3g} % of the torque unmet')
-    axes = states[:, 1]
-    link_rates = np.empty((len(times), 4))
+    wheel_maps = np.zeros((len(times), 2, 4))
     if branch is not None:
         for axis in range(2):
-            link_rates[:, twins[axis]] = link_rates[:, twins[axis + 2]] = axes[:, axis]
+            wheel_maps[:, axis, [twins[axis], twins[axis + 2]]] = 1.0
     else:
-        link_rates[:, :2] = axes
-        for row, (four, rates) in enumerate(zip(angles, axes)):
-            link_rates[row, 2:] = gamma_matrix(four, mechanism.link_lengths) @ rates
-    begin = np.zeros(4) if speeds is None else speeds
+        wheel_maps[:, 0, 0] = wheel_maps[:, 1, 1] = 1.0
+        wheel_maps[:, :, 2:] = [gamma_matrix(four, mechanism.link_lengths).T for four in angles]
+    link_rates = np.einsum('nki,nk->ni', wheel_maps, states[:, 1])
     # What a wheel gains is relative to its link.
-    return Spending(mechanism, times, angles, link_rates, torques,
-                    begin + gained + link_rates - link_rates[0])
+    absolute = gained + link_rates - link_rates[0] + (np.zeros(4) if speeds is None else speeds)
+    bearings = np.zeros_like(torques)
+    if table is not None:
+        shared = metric * wheel_maps
+        on_axes = np.einsum('nki,ni->nk', wheel_maps, forces_along(
+            angles, link_rates, constants, np.array([surroundings_of(table)])))
+        against = np.einsum('nki,nk->ni', shared, np.linalg.solve(
+            np.einsum('nki,nmi->nkm', shared, wheel_maps), on_axes[..., None])[..., 0])
+        torques += against
+        absolute += cumulative_trapezoid(against, times, axis=0, initial=0.0
+                                         ) / mechanism.flywheel_inertias
+        drives = drives_of(mechanism, table.wheel_bearings)
+        relative = absolute - link_rates
+        bearings[:] = [[bearing_torque(speed, 0.0, drives) for speed in four]
+                       for four in relative.tolist()]
+    return Spending(mechanism, times, angles, link_rates, torques, absolute, bearings)

@@ -21,14 +21,14 @@ equations of motion takes its forces from these two.
 
 from __future__ import annotations
 
-from math import sqrt
+from math import cos, sin, sqrt
 
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism.compiled import kernel
 from fourbar_ros.mechanism.constants import Array, Constants, record
 from fourbar_ros.mechanism.parameters import numbers
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 Four = tuple[float, float, float, float]
 
@@ -188,6 +188,28 @@ def generalized_forces(
         total_x += fx
         total_y += fy
     return (qa, qb, qc, qd), (total_x, total_y)
+
+
+@kernel
+def forces_along(angles: Array, rates: Array, constants: NDArray[np.record],
+                 around: NDArray[np.record]) -> Array:
+    """
+    Evaluate the generalized forces on the link angles along a motion, the mass centre at rest.
+
+    :param angles, rates: (n, 4) of the links [rad], [rad/s].
+    :param constants, around: (1,) of the mechanism, and of what surrounds it.
+    :returns: (n, 4) [N m].
+    """
+    found = np.empty((len(angles), 4))
+    for n in range(len(angles)):
+        a, b, c, d = angles[n]
+        on_links, _ = generalized_forces(
+            (cos(a), cos(b), cos(c), cos(d)), (sin(a), sin(b), sin(c), sin(d)),
+            (rates[n, 0], rates[n, 1], rates[n, 2], rates[n, 3]), (0.0, 0.0), constants[0],
+            around[0])
+        for link in range(4):
+            found[n, link] = on_links[link]
+    return found
 
 
 @kernel

@@ -22,13 +22,12 @@ table act at every step.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite, sin
+from math import isfinite
 
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import assemble, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix, mass_matrix
-from fourbar_ros.mechanism.forces import surroundings
 from fourbar_ros.mechanism.layout import (
     CENTRE_POSITION,
     CENTRE_VELOCITY,
@@ -48,12 +47,9 @@ from fourbar_ros.plant.motion import (
     SOUND,
 )
 from fourbar_ros.plant.sensors import LinkSensors
-from fourbar_ros.plant.table import quantum, Table
+from fourbar_ros.plant.table import quantum, surroundings_of, Table
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-# Standard gravity [m/s^2].
-GRAVITY = 9.80665
 
 # What dry friction in a joint makes of a rate must be slower than a step can follow (its real
 # limit for Runge-Kutta of order four is 2.8, here with a margin for other poses).
@@ -149,12 +145,7 @@ class Plant:
         # Arrays of one, see Boxed.
         self._constants = np.array([mechanism.constants])
         self._motors = np.array([drives_of(mechanism, table.wheel_bearings)])
-        self._around = np.array([surroundings(
-            joint_coulomb=table.joints.coulomb, joint_viscous=table.joints.viscous,
-            joint_static_ratio=table.joints.static_ratio,
-            stribeck_rate=table.joints.stribeck_rate, smoothing=table.joints.smoothing,
-            link_drag=table.links.drag, link_spin_drag=table.links.spin_drag,
-            gravity=GRAVITY * np.array([sin(surface.tilt_x), sin(surface.tilt_y)]))])
+        self._around = np.array([surroundings_of(table)])
         self._around['acting'] |= table.disturbance.acting
         self._walked = np.zeros(2)
         self._walked_for: float | None = None

@@ -18,15 +18,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, MISSING
-from math import inf, isfinite, pi
+from math import inf, isfinite, pi, sin
 from typing import Any
 
 from fourbar_ros.configuration import check_keys, config_file, load_yaml
 from fourbar_ros.errors import FourbarError
+from fourbar_ros.mechanism.forces import Surroundings, surroundings
 from fourbar_ros.plant.sensors import LinkSensorSettings, SensorError
 
 # A steeper table is a slide [rad].
 STEEPEST = 0.1
+# Standard gravity [m/s^2].
+GRAVITY = 9.80665
 
 
 class TableError(FourbarError):
@@ -217,6 +220,17 @@ def load_table(name: str) -> Table:
     """
     path = config_file('table', name)
     return Table.from_mapping(load_yaml(path), str(path))
+
+
+def surroundings_of(table: Table) -> Surroundings:
+    """Collect what acts on the links there, but for random torques."""
+    joints, surface = table.joints, table.surface
+    return surroundings(
+        joint_coulomb=joints.coulomb, joint_viscous=joints.viscous,
+        joint_static_ratio=joints.static_ratio, stribeck_rate=joints.stribeck_rate,
+        smoothing=joints.smoothing, link_drag=table.links.drag,
+        link_spin_drag=table.links.spin_drag,
+        gravity=[GRAVITY * sin(surface.tilt_x), GRAVITY * sin(surface.tilt_y)])
 
 
 def quantum(counts_per_turn: int) -> float:
