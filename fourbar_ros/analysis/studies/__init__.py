@@ -87,6 +87,7 @@ STUDIES = {
     'energy': Study('section 4, Fig. 4: what four wheels save over two, and when not'),
     'inertia': Study('section 4, Fig. 5: a search for wheel inertias, beside the closed form',
                      ('seed', 'jobs'), resumes=True),
+    'design': Study('wheels, motors and links for wanted manoeuvres, answered for the prototype'),
     'bus': Study('ten minutes of the prototype on a bus over loopback: lost frames, round trips'),
 }
 
