@@ -79,25 +79,23 @@ class TestbedClient:
 
     def follow(self, *topics):
         """Keep the newest status of `device_status` or `controller_status` in `statuses`."""
-        def keep(topic):
-            def on_status(message):
-                self.statuses[topic] = {item.key: item.value for item in message.values}
-            return on_status
-        for topic in topics:
-            if topic not in self._followed:
-                self._followed[topic] = self.node.create_subscription(
-                    DiagnosticStatus, topic, self.runtime.guard(keep(topic)), LATCHED)
+        def keep(topic, message):
+            self.statuses[topic] = {item.key: item.value for item in message.values}
+        self._subscribe(topics, DiagnosticStatus, LATCHED, keep)
 
     def follow_joints(self, *topics):
         """Keep the newest JointState of each topic in `joints`."""
-        def keep(topic):
-            def on_joints(message):
-                self.joints[topic] = message
-            return on_joints
+        self._subscribe(topics, JointState, SENSOR, self.joints.__setitem__)
+
+    def _subscribe(self, topics, kind, quality, keep):
+        """Subscribe to those that are not followed yet, and hand on topic and message."""
+        def keeping(topic):
+            # Callbacks with a default argument would get more than the message.
+            return lambda message: keep(topic, message)
         for topic in topics:
             if topic not in self._followed:
                 self._followed[topic] = self.node.create_subscription(
-                    JointState, topic, self.runtime.guard(keep(topic)), SENSOR)
+                    kind, topic, self.runtime.guard(keeping(topic)), quality)
 
     def leave_joints(self, *topics):
         """Follow these topics no longer; what was last heard stays in `joints`."""

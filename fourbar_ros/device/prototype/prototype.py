@@ -32,11 +32,11 @@ from fourbar_ros.device.protocol import (
     Drive,
     Finding,
     no_torque,
-    Reaction,
     Samples,
     WheelSample,
 )
 from fourbar_ros.device.prototype.heard import HeardLink
+from fourbar_ros.device.prototype.lookout import Lookout
 from fourbar_ros.device.prototype.messages import (
     AngleReport,
     BusError,
@@ -48,14 +48,13 @@ from fourbar_ros.device.prototype.messages import (
     FrameError,
     Heartbeat,
     Limits,
-    LinkState,
     MotorReport,
     Release,
     Stop,
     Sync,
     WheelReport,
 )
-from fourbar_ros.device.prototype.safety import SafetyTable, SafetyWatch
+from fourbar_ros.device.prototype.safety import SafetyTable
 from fourbar_ros.mechanism import LINK_NAMES, Mechanism
 from fourbar_ros.plant import SensorReading
 import numpy as np
@@ -140,20 +139,14 @@ class Prototype(Device):
         self._steady_ns = steady_ns
         self._stamp_of = stamp_of
         self._answer_timeout_ns = round(answer_timeout_s * 1e9)
-        self._safety = SafetyWatch(safety)
         self._counts: Counter[str] = Counter()
         self._state = DeviceState.DISARMED
         self._drive = no_torque()
-        self._since_ns = steady_ns()
         self._sequences = [0, 0, 0, 0]
         self._counter = 0
         self._sent_ns = [0] * COUNTERS
-        self._findings: tuple[Finding, ...] = ()
-        self._armed_boots = [0, 0, 0, 0]
-        # Whether a finding ended the driving and something is still wrong: it may get worse.
-        self._watched = False
-        self._bad = 0
-        self._bad_since_ns = self._since_ns
+        self._silent_ns = safety['wheel_silent'].limit * 1e9
+        self._lookout = Lookout(mechanism, safety, self.links, steady_ns())
 
     def step(self, stamp_ns: int, drive: Drive) -> Samples:
         """
@@ -169,7 +162,8 @@ class Prototype(Device):
             self._lose_bus()
             raise
         now_ns = self._steady_ns()
-        self._look(now_ns)
+        self._lookout.look(now_ns, self._drive, sum(
+            self._counts[kind] + sum(link.counts[kind] for link in self.links) for kind in BAD))
         return self._samples(stamp_ns, now_ns, round_trip_ns)
 
     def drive(self, drive: Drive) -> None:
@@ -190,11 +184,7 @@ class Prototype(Device):
     def gate_changed(self, state: DeviceState) -> None:
         """Stop or release the links at once, and remember how they are when they are armed."""
         was, self._state = self._state, state
-        self._watched = (was, state) == (DeviceState.ARMED, DeviceState.DISARMED) and bool(
-            self._findings)
-        if state is DeviceState.ARMED:
-            self._since_ns = self._steady_ns()
-            self._armed_boots = [link.boots for link in self.links]
+        self._lookout.gate_changed(state, self._steady_ns())
         if self._bus is None:
             return
         try:
@@ -207,15 +197,11 @@ class Prototype(Device):
 
     def obstacles(self) -> Sequence[str]:
         """Tell what speaks against arming: links, wheels, clocks, and what must not go on."""
-        told = [f'{name}: {text}' for name, link in zip(LINK_NAMES, self.links)
-                for text in self._obstacles_of(link)]
-        told += [finding.text for finding in self._safety.findings()
-                 if finding.reaction is not Reaction.WARN and finding.text not in told]
-        return told
+        return self._lookout.obstacles()
 
     def findings(self) -> Sequence[Finding]:
         """Tell what was found at the last step that must have consequences."""
-        return self._findings
+        return self._lookout.findings
 
     def diagnosis(self) -> dict[str, str]:
         """Tell what is not as it should be."""
@@ -227,10 +213,8 @@ class Prototype(Device):
         if missing := [name for name, link in zip(LINK_NAMES, self.links)
                        if link.heartbeat_ns is None]:
             told['missing'] = f'waiting for {", ".join(missing)}: never heard'
-        for finding in self._safety.findings():
-            # The worst first, and none hides another.
-            where = finding.text.partition(':')[0]
-            told[where] = '; '.join(filter(None, (told.get(where), finding.text)))
+        for where, text in self._lookout.troubles().items():
+            told[where] = '; '.join(filter(None, (told.get(where), text)))
         return told
 
     def facts(self) -> dict[str, object]:
@@ -381,8 +365,7 @@ class Prototype(Device):
                     measured_ns + shift_ns, (name,),
                     np.array([np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi]), rates))
         readings.sort(key=lambda reading: reading.stamp_ns)
-        silent_ns = self._safety.table['wheel_silent'].limit * 1e9
-        complete = all(link.answer_ns is not None and now_ns - link.answer_ns <= silent_ns
+        complete = all(link.answer_ns is not None and now_ns - link.answer_ns <= self._silent_ns
                        for link in self.links)
         tick_ns = stamp_ns - shift_ns
         wheels = WheelSample(
@@ -396,88 +379,3 @@ class Prototype(Device):
                 None if round_trip_ns is None else round_trip_ns * 1e-9,
                 max(ages) * 1e-9 if ages else None,
                 max(link.clock.jitter for link in self.links)))
-
-    def _obstacles_of(self, link: HeardLink) -> list[str]:
-        if link.heartbeat_ns is None:
-            return ['was never heard']
-        told = []
-        if link.answer_ns is None:
-            told.append('its wheel was never heard')
-        if not link.clock.settled:
-            told.append('its clock is not known yet')
-        if link.state not in (LinkState.IDLE, LinkState.COASTING, None):
-            told.append(f'its electronics say {link.state.name.lower()}')
-        limit = self._safety.table['wheel_speed_to_arm'].limit
-        if abs(link.wheel_speed) > limit:
-            told.append(f'its wheel turns at {abs(link.wheel_speed):.3g} rad/s, limit {limit:g}')
-        return told
-
-    def _look(self, now_ns: int) -> None:
-        """Compare everything with its limit."""
-        for index, (name, link) in enumerate(zip(LINK_NAMES, self.links)):
-            if link.heartbeat_ns is not None:
-                self._look_at(index, name, link, now_ns)
-        bad = sum(self._counts[kind] + sum(link.counts[kind] for link in self.links)
-                  for kind in BAD)
-        elapsed_s = (now_ns - self._bad_since_ns) * 1e-9
-        if elapsed_s >= 1.0:
-            rate = (bad - self._bad) / elapsed_s
-            self._safety.look(
-                'bad_frames', 'bus', rate > self._safety.table['bad_frames'].limit, rate,
-                '{0:.0f} frames a second are no good, limit {1:g}', now_ns)
-            self._bad, self._bad_since_ns = bad, now_ns
-        found = tuple(finding for finding in self._safety.findings()
-                      if finding.reaction is not Reaction.WARN)
-        self._watched &= bool(found)
-        if self._watched:
-            found = tuple(finding for finding in found if finding.reaction is Reaction.STOP)
-        elif self._state is not DeviceState.ARMED:
-            found = ()
-        self._findings = found
-
-    def _look_at(self, index: int, name: str, link: HeardLink, now_ns: int) -> None:
-        table, look = self._safety.table, self._safety.look
-        armed = self._state is DeviceState.ARMED
-        assert link.heartbeat_ns is not None
-        silence = (now_ns - (link.answer_ns or self._since_ns)) * 1e-9
-        look('wheel_silent', name, silence > table['wheel_silent'].limit, silence,
-             'its wheel has not answered for {0:.3g} s, limit {1:g}', now_ns)
-        silence = (now_ns - link.heartbeat_ns) * 1e-9
-        look('heartbeat_lost', name, silence > table['heartbeat_lost'].limit, silence,
-             'no heartbeat for {0:.3g} s, limit {1:g}', now_ns)
-        boots = link.boots - self._armed_boots[index] if armed else 0
-        look('reboot', name, boots > table['reboot'].limit, boots,
-             'it has started anew while it was armed', now_ns)
-        look('two_of_one_id', name, link.twins > table['two_of_one_id'].limit, link.twins + 1,
-             '{0} links answer to its id', now_ns)
-        powered = armed and bool(self._drive.powered[index])
-        state = '' if link.state is None else link.state.name.lower()
-        look('not_armed', name, powered and link.state not in (LinkState.ARMED, None), state,
-             'it was told to drive, but says that it is {0}', now_ns)
-        torque_limit = float(self.mechanism.motor_torque_limits[index])
-        speed_limit = table['overspeed'].limit * float(self.mechanism.motor_speed_limits[index])
-        speed = abs(link.wheel_speed)
-        look('overspeed', name, speed > speed_limit, speed,
-             f'its wheel turns at {{0:.4g}} rad/s, limit {speed_limit:.4g}', now_ns)
-        look('unasked_torque', name, not powered and armed
-             and abs(link.torque) > table['unasked_torque'].limit * torque_limit, link.torque,
-             'its motor gives {0:.3g} N m without power', now_ns)
-        asked = float(self._drive.values[index])
-        by_torque = powered and not bool(self._drive.by_speed[index])
-        look('disagreement', name, by_torque and abs(asked - link.torque)
-             > table['disagreement'].limit * torque_limit, link.torque - asked,
-             'its motor is {0:.3g} N m off what it was told', now_ns)
-        self._look_at_health(name, link, now_ns)
-
-    def _look_at_health(self, name: str, link: HeardLink, now_ns: int) -> None:
-        beat, table, look = link.heartbeat, self._safety.table, self._safety.look
-        assert beat is not None
-        faults = ', '.join(sorted(beat.faults - {'no_limits'}))
-        look('link_fault', name, bool(faults), faults, 'its electronics tell of {0}', now_ns)
-        for row in ('hot', 'overtemperature'):
-            look(row, name, beat.temperature is not None
-                 and beat.temperature > table[row].limit, beat.temperature,
-                 'it has {0:.3g} deg C, limit {1:g}', now_ns)
-        for row in ('low_voltage', 'undervoltage'):
-            look(row, name, beat.voltage is not None and beat.voltage < table[row].limit,
-                 beat.voltage, 'its supply has {0:.3g} V, at least {1:g}', now_ns)
