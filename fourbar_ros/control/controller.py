@@ -140,7 +140,7 @@ class Controller:
         self._period = 0.0
         self._checked_period = 0.0
         self._lost = 0
-        self._late = False
+        self._unknown = False
         self._gain_problem = ''
         self._bearings = _bearings_of(settings)
         self.law.tune(settings, ALL)
@@ -281,10 +281,11 @@ class Controller:
         guide, driving = self._guide, self.mode not in ('disarmed', 'idle')
         friction = self._drive.look(wheel_speeds, self.settings)
         if driving and was not in ('disarmed', 'idle'):
-            # The first period of which the command is known begins at the second tick in time.
-            known = not (late or self._late) and self._is_single(period)
-            self._watch(period, known, link_rates, wheel_speeds, efforts)
-        self._late = late
+            # The first period of which the command is known begins at the second tick in time, and
+            # after a gap the first speeds are means of all of it.
+            unknown = late or not self._is_single(period)
+            self._watch(period, not (unknown or self._unknown), link_rates, wheel_speeds, efforts)
+            self._unknown = unknown
         if guide.follow(stamp_ns) and self.mode == 'track':
             self.mode = 'hold'
         if not driving or self.mode == 'damp':

@@ -32,20 +32,26 @@ import pytest
 SEEDS = range(6)
 
 
-def run(loop: ClosedLoop, seed: int, seconds: float, loss: float, longest: int) -> None:
+def run(loop: ClosedLoop, seed: int, seconds: float, loss: float, longest: int, device: bool
+        ) -> None:
     """
-    Hold estimator and controller up now and then, from the first tick on.
+    Hold estimator and controller, or the device, up now and then, from the first tick on.
 
     Of the ticks meanwhile the last few wait for them, as they do in a subscription; the commands
-    for these come all at once, when their time has passed.
+    for these come all at once, when their time has passed. A device that is held up leaves ticks
+    out, and its wheels go on as they were told.
 
     :param loss: share of ticks at which they are held up.
     :param longest: for so many ticks at most.
+    :param device: who.
     """
     rng = np.random.default_rng(seed)
     away, waiting = 0, deque[tuple[int, Samples]](maxlen=5)
     for tick in range(round(seconds * 1e9 / loop.testbed.device.period_ns)):
         stamp_ns = FIRST_STAMP_NS + tick * loop.testbed.device.period_ns
+        if device and away:
+            away -= 1
+            continue
         samples, _ = loop.testbed.tick(stamp_ns, stamp_ns)
         loop.testbed.published(stamp_ns, 0)
         waiting.append((stamp_ns, samples))
@@ -86,8 +92,9 @@ def answer(loop: ClosedLoop, stamp_ns: int, samples: Samples, now_ns: int) -> No
 @pytest.mark.parametrize('preset', ['paper', 'prototype'])
 @pytest.mark.parametrize('command', ['effort', 'velocity'])
 @pytest.mark.parametrize(('loss', 'longest'), [(0.05, 5), (0.01, 40)])
+@pytest.mark.parametrize('device', [False, True], ids=['loop', 'device'])
 def test_healthy_wheels_stay_healthy(
-    preset: str, command: str, loss: float, longest: int,
+    preset: str, command: str, loss: float, longest: int, device: bool,
 ) -> None:
     scenario = load_scenario(preset)
     controller = replace(scenario.controller, command=command, setpoint_duration=1.0,
@@ -95,5 +102,5 @@ def test_healthy_wheels_stay_healthy(
     for seed in SEEDS:
         scenario = replace(scenario, seed=seed)
         loop = make_loop(replace(scenario, controller=controller))
-        run(loop, seed, 4.0, loss, longest)
+        run(loop, seed, 4.0, loss, longest, device)
         assert not loop.controller.wheels.findings(), f'seed {seed}'
