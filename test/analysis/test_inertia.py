@@ -137,7 +137,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         seeds.append(search.seed)
         return find(search)
 
-    monkeypatch.setattr(inertia_search, 'GENERATIONS', 30)
+    monkeypatch.setattr(inertia_search, 'GENERATIONS', 10)
     monkeypatch.setattr(inertia, 'WEIGHTS', (0.01,))
     monkeypatch.setattr(inertia, 'SEEDS', 2)
     monkeypatch.setattr(inertia, 'INERTIA_WEIGHTS', (1.0,))

@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import contextlib
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 import io
 import json
 from math import degrees, inf, sqrt
@@ -101,7 +101,7 @@ class Found:
         """Tracking error, rms [deg]."""
         return degrees(self.candidate.error_rms)
 
-    @property
+    @cached_property
     def over_least(self) -> float:
         """Eq. 9 over the least that is possible at this error."""
         return self.ratio / least_at_error(self.candidate.error_rms)
