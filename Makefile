@@ -37,12 +37,13 @@ bench: $(INSTALLED)
 	@$(VENV)/bin/fourbar bench --json bench.json $(ARGS)
 
 # Those that start processes come one after the other, and wait for each other most of the time. The
-# rest compute in the meantime, with what is left of the machine, and are told of afterwards.
+# rest compute in the meantime, with what is left of the machine, one thread each, and are told of
+# afterwards.
 ALONE := node or package
 LEISURELY := $(shell command -v chrt >/dev/null && echo chrt --idle 0 || echo nice -n 19)
 test: $(INSTALLED)
 ifeq ($(ARGS),)
-	@$(LEISURELY) $(VENV)/bin/pytest -m 'not ($(ALONE))' -n auto --dist loadfile \
+	@OPENBLAS_NUM_THREADS=1 $(LEISURELY) $(VENV)/bin/pytest -m 'not ($(ALONE))' -n auto --dist loadfile \
 	  > $(VENV)/rest.log 2>&1 & rest=$$!; trap 'kill $$rest' INT TERM; \
 	$(VENV)/bin/pytest -m '$(ALONE)'; alone=$$?; \
 	wait $$rest; others=$$?; cat $(VENV)/rest.log; \
