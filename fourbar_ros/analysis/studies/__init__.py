@@ -75,6 +75,7 @@ OPTIONS = {
                    'crossing 300)', int),
     'seed': Option('S', 'of the first run of each kind, the others follow it (default 0)', int),
     'jobs': Option('N', 'processes, which change nothing but the time (default all cores)', int),
+    'mechanism': Option('NAME', 'a linkage to look at as well, a preset or a mechanism file'),
 }
 _DRAWN = ('runs', 'seed', 'jobs')
 
@@ -87,6 +88,8 @@ STUDIES = {
     'energy': Study('section 4, Fig. 4: what four wheels save over two, and when not'),
     'inertia': Study('section 4, Fig. 5: a search for wheel inertias, beside the closed form',
                      ('seed', 'jobs'), resumes=True),
+    'conditioning': Study('section 5, Fig. 6: cond(A) over lengths and offsets, and what it hides',
+                          ('mechanism',)),
     'design': Study('wheels, motors and links for wanted manoeuvres, answered for the prototype'),
     'bus': Study('ten minutes of the prototype on a bus over loopback: lost frames, round trips'),
 }

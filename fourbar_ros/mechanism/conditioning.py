@@ -1,0 +1,186 @@
+# Copyright 2026 The fourbar_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How well a linkage can be moved over its configurations, for many linkages at once.
+
+cond(A) of paper eq. 6 is one answer, and depends on which two angles are the axes. What does not:
+how near a change point is, which inertia the motions have, and what wheels can do. For these the
+motions that the closure admits, `J omega = 0`, are measured by the rates of all four links, in an
+orthonormal basis N of them (docs/studies.md, conditioning).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import cos, hypot, nan, sin, sqrt
+
+from fourbar_ros.mechanism.closure import BRANCHES, ClosureError
+from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.mechanism.constants import Array, Constants, PAIRS
+from fourbar_ros.mechanism.forces import Four
+from fourbar_ros.mechanism.parameters import Mechanism
+from fourbar_ros.mechanism.reduced import close_loop, pair_inertias, reduced_terms
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+WHEELS: NDArray[np.bool_] = np.array(
+    [[True] * 4, *(np.arange(4) != lost for lost in range(4)),
+     *([wheel in pair for wheel in range(4)] for pair in PAIRS)])
+"""Which wheels are left (11, 4): all, all but a, b, c or d, then pairs ab, ac, ad, bc, bd, cd."""
+
+NUMBERS = 4 + len(WHEELS)
+
+
+@dataclass(frozen=True, eq=False)
+class Conditioning:
+    """
+    How well linkages can be moved; arrays (m, n) of m linkages in n configurations.
+
+    All are NaN where the loop cannot close, and at a change point itself.
+
+    :param condition: cond(A) of paper eq. 6, in the axes a and b. Grows without limit where links
+        c and d fold onto a line, where Gamma does not exist.
+    :param condition_of_motions: cond of the inertia of the motions, per rates of all four links.
+        The same whichever links are the axes.
+    :param alignment: `|sin(phi_d - phi_c)|`, which vanishes where Gamma does not exist.
+    :param closure_ratio: smallest over largest singular value of the closure Jacobian J. It
+        vanishes at change points and nowhere else.
+    :param gains: (m, n, 11) for the `WHEELS` that are left, what torques do along the motion
+        that they drive least, per link rate and in the metric of `min_energy`: the smallest
+        singular value of `N^T diag(If / max If)^(1/2)`, N an orthonormal basis of the motions.
+        From 0 (a motion that they do not drive) to 1.
+    """
+
+    condition: Array
+    condition_of_motions: Array
+    alignment: Array
+    closure_ratio: Array
+    gains: Array
+
+
+def conditioning_grid(mechanisms: Sequence[Mechanism], thetas: ArrayLike, branch: str = 'open'
+                      ) -> Conditioning:
+    """
+    Evaluate linkages over configurations.
+
+    :param mechanisms: (m,) any lengths.
+    :param thetas: (n,) `phi_b - phi_a` [rad]. At 0, where branches have no names, the side of
+        those above it is taken.
+    :param branch: `open` or `crossed`.
+    :raises ClosureError: there is no such branch.
+    """
+    if branch not in BRANCHES:
+        raise ClosureError(f'unknown branch {branch!r} (known are {", ".join(BRANCHES)})')
+    constants = np.array([mechanism.constants for mechanism in mechanisms])
+    found = _grid(constants, np.ascontiguousarray(thetas, dtype=float),
+                  1.0 if branch == 'open' else -1.0, WHEELS.astype(float))
+    return Conditioning(found[..., 0], found[..., 1], found[..., 2], found[..., 3], found[..., 4:])
+
+
+@kernel
+def _grid(constants: NDArray[np.record], thetas: Array, branch: float, wheels: Array) -> Array:
+    out = np.empty((constants.size, thetas.size, NUMBERS))
+    for m in range(constants.size):
+        for n in range(thetas.size):
+            _evaluate(constants[m], cos(thetas[n]), sin(thetas[n]), branch, wheels, out[m, n])
+    return out
+
+
+@kernel
+def _evaluate(constants: Constants, cosine: float, sine: float, branch: float, wheels: Array,
+              out: Array) -> None:
+    """Fill in the numbers of one linkage in one configuration (NUMBERS,)."""
+    l_a, l_b, l_c, l_d = (constants.lengths[0], constants.lengths[1], constants.lengths[2],
+                          constants.lengths[3])
+    out[:] = nan
+    side = branch if sine >= 0.0 else -branch
+    cx, cy, dx, dy, fold, inverse_fold = close_loop(cosine, sine, side, constants.lengths)
+    # Links with their signs in the closure; J = (-y; x).
+    x = (-l_a, l_b * cosine, cx, -dx)
+    y = (0.0, l_b * sine, cy, -dy)
+    first, second, determinant = motions(x, y)
+    # Written so that NaN, a loop that cannot close, leaves everything blank.
+    if not determinant > 0.0:
+        return
+    xx = xy = yy = 0.0
+    for i in range(4):
+        xx += x[i] * x[i]
+        xy += x[i] * y[i]
+        yy += y[i] * y[i]
+    largest = 0.5 * (xx + yy) + hypot(0.5 * (xx - yy), xy)
+    a00, a01, a11, _, _, _, _, _, _, _, _ = reduced_terms(
+        cosine, sine, cx, cy, dx, dy, inverse_fold, 0.0, 0.0, constants)
+    out[0] = _condition(a00, a01, a11)
+    m_ab, m_ac, m_ad, m_bc, m_bd, m_cd, _, _, _, _, _, _ = pair_inertias(
+        cosine, sine, cx, cy, dx, dy, constants)
+    inertia = np.diag(constants.own_inertias)
+    inertia[0, 1] = inertia[1, 0] = m_ab
+    inertia[0, 2] = inertia[2, 0] = m_ac
+    inertia[0, 3] = inertia[3, 0] = m_ad
+    inertia[1, 2] = inertia[2, 1] = m_bc
+    inertia[1, 3] = inertia[3, 1] = m_bd
+    inertia[2, 3] = inertia[3, 2] = m_cd
+    of_first, of_second = inertia @ first, inertia @ second
+    out[1] = _condition((first * of_first).sum(), (first * of_second).sum(),
+                        (second * of_second).sum())
+    out[2] = abs(fold) / (l_c * l_d)
+    out[3] = sqrt(determinant) / largest
+
+    strongest = constants.flywheel_inertias.max()
+    for row in range(wheels.shape[0]):
+        g00 = g01 = g11 = determinant = 0.0
+        for i in range(4):
+            weight = wheels[row, i] * constants.flywheel_inertias[i] / strongest
+            g00 += weight * first[i] * first[i]
+            g01 += weight * first[i] * second[i]
+            g11 += weight * second[i] * second[i]
+            for k in range(i):
+                determinant += (
+                    weight * wheels[row, k] * constants.flywheel_inertias[k] / strongest
+                    * (first[i] * second[k] - first[k] * second[i]) ** 2)
+        out[4 + row] = sqrt(determinant / (0.5 * (g00 + g11) + hypot(0.5 * (g00 - g11), g01)))
+
+
+@kernel
+def motions(x: Four, y: Four) -> tuple[Array, Array, float]:
+    """
+    Work out an orthonormal basis of the link rates that the closure admits.
+
+    The minors of J, in dual order, make an antisymmetric Q that J annuls and that turns the plane
+    of the motions by a quarter, times the root of det(J J^T). So a small determinant costs few
+    digits.
+
+    :param x, y: the links with their signs [m]; J = (-y; x).
+    :returns: two vectors (4,), and det(J J^T) [m^4]; no numbers where that vanishes.
+    """
+    dual = np.zeros((4, 4))
+    for i, k, m, n, sign in ((0, 1, 2, 3, 1.0), (0, 2, 1, 3, -1.0), (0, 3, 1, 2, 1.0),
+                             (1, 2, 0, 3, 1.0), (1, 3, 0, 2, -1.0), (2, 3, 0, 1, 1.0)):
+        minor = sign * (x[m] * y[n] - x[n] * y[m])
+        dual[i, k], dual[k, i] = minor, -minor
+    squares = (dual * dual).sum(axis=0)
+    determinant = 0.5 * squares.sum()
+    column = np.argmax(squares)
+    first = dual[:, column] / sqrt(squares[column])
+    return first, dual @ first / sqrt(determinant), determinant
+
+
+@kernel
+def _condition(a00: float, a01: float, a11: float) -> float:
+    """Return the condition number of a symmetric positive definite matrix."""
+    half = 0.5 * (a00 + a11)
+    spread = hypot(0.5 * (a00 - a11), a01)
+    return (half + spread) / (half - spread)
