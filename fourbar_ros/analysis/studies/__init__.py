@@ -90,6 +90,7 @@ STUDIES = {
                      ('seed', 'jobs'), resumes=True),
     'conditioning': Study('section 5, Fig. 6: cond(A) over lengths and offsets, and what it hides',
                           ('mechanism',)),
+    'singularity': Study('sections 1 and 5: a collapsed four-bar, driven at joints and by wheels'),
     'design': Study('wheels, motors and links for wanted manoeuvres, answered for the prototype'),
     'bus': Study('ten minutes of the prototype on a bus over loopback: lost frames, round trips'),
 }
