@@ -48,7 +48,7 @@ TIMES = np.linspace(0.0, 10.0, 101)
 STEP, FINE_STEP = 0.01, 1e-3    # to seek with, and to check with [s]
 THETA = np.pi / 3.0     # at the start, as in study validation
 
-# Amplitudes of the wheels' angle [rad]. At 110 rad link a comes to lie on link b.
+# Amplitudes of the wheels' angle [rad]. At 111 rad link a comes to lie on link b.
 AMPLITUDES = np.linspace(4.0, 104.0, 21)
 SMALLEST = 1e-7
 SOLVED = 1e-4   # deg
