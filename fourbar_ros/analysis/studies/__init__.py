@@ -85,6 +85,7 @@ STUDIES = {
                          'bound', _DRAWN),
     'crossing': Study('change points with four wheels and with two: crossing, parking, turning '
                       'there', _DRAWN, runs=300),
+    'cad': Study('section 3, Fig. 3: which defect of a CAD model makes its differences'),
     'energy': Study('section 4, Fig. 4: what four wheels save over two, and when not'),
     'inertia': Study('section 4, Fig. 5: a search for wheel inertias, beside the closed form',
                      ('seed', 'jobs'), resumes=True),
