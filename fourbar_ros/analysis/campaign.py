@@ -21,7 +21,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 import contextlib
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 import os
 import signal
 import threading
@@ -62,8 +62,7 @@ def in_processes(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: 
     if jobs == 1 or len(items) < 2:
         yield from map(work, items)
         return
-    # Not by fork: whoever calls may have threads.
-    pool = ProcessPoolExecutor(min(jobs, len(items)), mp_context=get_context('spawn'))
+    pool = _pool(min(jobs, len(items)))
     try:
         with _interrupts_ignored(), _one_thread_each():
             waiting = deque(pool.submit(work, item) for item in items)
@@ -93,7 +92,7 @@ def as_ready(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: int
     waiting, died = deque(items), 0
     while waiting:
         running: dict[Future[_Found], _Item] = {}
-        pool = ProcessPoolExecutor(min(jobs, len(items)), mp_context=get_context('spawn'))
+        pool = _pool(min(jobs, len(items)))
         try:
             while waiting or running:
                 with _interrupts_ignored(), _one_thread_each():
@@ -113,6 +112,22 @@ def as_ready(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: int
             waiting.extendleft(reversed(running.values()))
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def _pool(jobs: int) -> ProcessPoolExecutor:
+    """Make processes, not by fork: whoever calls may have threads."""
+    return ProcessPoolExecutor(jobs, mp_context=get_context('spawn'), initializer=_end_together)
+
+
+def _end_together() -> None:
+    """Let this process end when its parent is killed, instead of waiting for work for ever."""
+    parent = parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextlib.contextmanager

@@ -25,6 +25,8 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 import contextlib
 import logging
+from queue import Empty, SimpleQueue
+import time
 from typing import Any
 
 from fourbar_ros.analysis.campaign import CampaignError
@@ -62,7 +64,9 @@ def on_cluster(campaign: Campaign, batches: Sequence[Sequence[int]], address: st
         try:
             client = distributed.Client(address, timeout=CONNECTING, set_as_default=False)
         except (OSError, TimeoutError, ValueError, ImportError) as error:
-            raise CampaignError(f'no scheduler at {address} ({_line(error)}): start one with '
+            reason = (f'within {CONNECTING:g} s' if isinstance(error, (OSError, TimeoutError))
+                      else f'({_line(error)})')
+            raise CampaignError(f'no scheduler at {address} {reason}: start one with '
                                 '`dask scheduler`, or leave --scheduler away') from None
         try:
             _check_workers(client, address, campaign)
@@ -111,25 +115,22 @@ def _spread(client: Any, address: str, campaign: Campaign, batches: Sequence[Seq
     gone = CampaignError(f'the scheduler {address} is gone')
     waiting = deque(tuple(batch) for batch in batches)
     running: dict[Any, tuple[int, ...]] = {}
-    without = 0.0
+    ready: SimpleQueue[Any] = SimpleQueue()
+    seen = time.monotonic()
     try:
         while waiting or running:
             threads = sum(client.nthreads().values())
-            without = 0.0 if threads else without + LOOK
-            if without > NO_WORKER:
+            if threads:
+                seen = time.monotonic()
+            elif time.monotonic() - seen > NO_WORKER:
                 raise CampaignError(f'the scheduler {address} has had no workers for '
                                     f'{NO_WORKER:g} s')
             while waiting and len(running) < AHEAD * max(threads, 1):
                 batch = waiting.popleft()
-                running[client.submit(work, campaign, batch, pure=False)] = batch
-            try:
-                done = distributed.wait(
-                    list(running), timeout=LOOK, return_when='FIRST_COMPLETED').done
-            except TimeoutError:
-                done = ()
-            if client.status != 'running':
-                raise gone
-            for future in done:
+                future = client.submit(work, campaign, batch, pure=False)
+                running[future] = batch
+                future.add_done_callback(ready.put)
+            for future in _next(ready):
                 batch = running.pop(future)
                 try:
                     yield future.result()
@@ -140,12 +141,22 @@ def _spread(client: Any, address: str, campaign: Campaign, batches: Sequence[Seq
                     else:
                         yield [lost_run(campaign, batch[0], 'every worker that took it died, by '
                                                             'lack of memory perhaps')]
+            if client.status != 'running':
+                raise gone
     except (OSError, TimeoutError, distributed.CancelledError,
             CommClosedError):
         raise gone from None
     finally:
         with contextlib.suppress(Exception):  # noqa: BLE001 - the scheduler may be anything now
             client.cancel(list(running))
+
+
+def _next(ready: SimpleQueue[Any]) -> Iterator[Any]:
+    """Return what is ready, after waiting a while for the first."""
+    with contextlib.suppress(Empty):
+        yield ready.get(timeout=LOOK)
+        while True:
+            yield ready.get_nowait()
 
 
 def work(campaign: Campaign, batch: Sequence[int]) -> list[Row]:
@@ -158,13 +169,17 @@ def work(campaign: Campaign, batch: Sequence[int]) -> list[Row]:
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Keep what Dask logs of lost connections to itself: it is said in one line."""
-    logger = logging.getLogger('distributed')
-    before = logger.level
-    logger.setLevel(logging.CRITICAL + 1)
+    # Dask gives some of its loggers levels of their own.
+    loggers = [logging.getLogger(name) for name in (
+        'distributed', 'distributed.client', 'distributed.core', 'distributed.comm')]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
     try:
         yield
     finally:
-        logger.setLevel(before)
+        for logger, level in zip(loggers, before):
+            logger.setLevel(level)
 
 
 def _line(error: BaseException) -> str:

@@ -249,15 +249,15 @@ def _nominal(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     if 'duration' in values:
         changes['duration'] = values['duration']
     for each, value in changes.items():
-        put(description, place_of(str(each), description, 'set'), value)
+        put(description, place_of(str(each), description, 'set', True), value)
     return description
 
 
 def _parameters(vary: Mapping[str, Any], description: Mapping[str, Any]
                 ) -> tuple[Parameter, ...]:
     found: list[Parameter] = []
-    for name, given in vary.items():
-        place = place_of(str(name), description, 'vary')
+    for name, given in ((str(name), given) for name, given in vary.items()):
+        place = place_of(name, description, 'vary')
         kind, values, options = distribution(name, given)
         nominal = value_at(description, place)
         how = 'scale' if options.get('scale') else 'add' if options.get('add') else ''

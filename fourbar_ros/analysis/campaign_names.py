@@ -39,11 +39,13 @@ _LETTERS = 'abcd'
 _WORDS = re.compile(r'(?:^|\.)([A-Za-z_]\w*)|\[(\d+)\]')
 
 
-def place_of(name: str, description: Mapping[str, Any], where: str) -> Place:
+def place_of(name: str, description: Mapping[str, Any], where: str, sections: bool = False
+             ) -> Place:
     """
     Find what a name stands for: a value, or an array of numbers.
 
     :param where: in which section of the campaign it is, for messages.
+    :param sections: whether it may be a section.
     :raises CampaignError: there is none; the nearest names are told.
     """
     place: list[str | int] = []
@@ -64,7 +66,7 @@ def place_of(name: str, description: Mapping[str, Any], where: str) -> Place:
             raise _unknown(name, description, where)
         place.append(key)
         value = value[key]
-    if not place or not _is_value(value):
+    if not place or not (sections or _is_value(value)):
         raise CampaignError(f'{where}: {name!r} is a section, name one of its values'
                             f'{nearest(name + ".", names_of(description))}')
     return tuple(place)

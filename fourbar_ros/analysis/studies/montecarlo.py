@@ -55,7 +55,7 @@ import yaml
 
 # Runs are given away in batches of about so much work [s], guessed from what a tick takes [s].
 BATCH, TICK = 2.0, 3e-4
-MOST_IN_BATCH = 64
+MOST_IN_BATCH = 32
 # So many of the strongest correlations are printed.
 PRINTED = 10
 
@@ -159,7 +159,8 @@ def _result(campaign: Campaign, table: pa.Table, with_time: pa.Table) -> Result:
         files['montecarlo.png'] = distributions_png(metrics, described, campaign.limits,
                                                     len(reasons))
         if strongest:
-            files['montecarlo_parameters.png'] = scatter_png(drawn, metrics, strongest)
+            files['montecarlo_parameters.png'] = scatter_png(
+                campaign.parameters, drawn, metrics, strongest)
     except ImportError as error:
         skipped.append(f'no figure: {error.name} is missing')
     return Result(checks_of(campaign.limits, metrics, len(reasons)), data,

@@ -16,11 +16,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import io
 from math import ceil
 
 from fourbar_ros.analysis import style
+from fourbar_ros.analysis.campaign_draws import Parameter
 from fourbar_ros.analysis.campaign_file import Limit
 from fourbar_ros.analysis.campaign_run import METRICS
 from fourbar_ros.analysis.campaign_summary import Correlation, Statistics
@@ -43,6 +44,7 @@ TITLES = {
 }
 MAIN = ('tracking_rms_rad', 'final_error_rad', 'estimate_rms_rad', 'nees_per_degree_of_freedom',
         'peak_wheel_speed_rad_s', 'work_j')
+HOW = {'': '', 'scale': ', times nominal', 'add': ', added'}
 COLUMNS, PANELS = 3, 6
 BINS = 30
 DPI = 110
@@ -72,14 +74,18 @@ def distributions_png(metrics: Mapping[str, Array], described: Mapping[str, Stat
     return _png(draw)
 
 
-def scatter_png(drawn: Mapping[str, Array], metrics: Mapping[str, Array],
-                strongest: Sequence[Correlation]) -> bytes:
+def scatter_png(parameters: Sequence[Parameter], drawn: Mapping[str, Array],
+                metrics: Mapping[str, Array], strongest: Sequence[Correlation]) -> bytes:
     """
     Draw the strongest correlations, of each main metric at most two.
 
+    :param parameters: that are drawn.
     :param drawn, metrics: (runs,) by name, NaN for none.
     :param strongest: in this order.
     """
+    labels = {name: name + HOW[parameter.how] for parameter in parameters
+              for name in parameter.columns}
+
     def draw() -> Figure:
         shown = _shown(strongest)
         rows = ceil(len(shown) / COLUMNS)
@@ -87,6 +93,7 @@ def scatter_png(drawn: Mapping[str, Array], metrics: Mapping[str, Array],
         axes = np.ravel(figure.subplots(rows, COLUMNS))
         for panel, each in zip(axes, shown):
             _scatter(panel, each, drawn[each.parameter], metrics[each.metric])
+            panel.set_xlabel(labels[each.parameter])
         for panel in axes[len(shown):]:
             panel.set_visible(False)
         figure.suptitle('What the runs depend on most', x=0.01, ha='left', fontsize=10.5,
@@ -125,14 +132,23 @@ def _histogram(axes: Axes, name: str, values: Array, found: Statistics, limits: 
                      linestyle=dash)
         axes.annotate(text, (factor * value, 0.87), xycoords=('data', 'axes fraction'),
                       ha='center', fontsize=7.5, color=COLOURS['ink'])
+    low, high = axes.get_xlim()
     for limit in limits:
         bound = limit.at_most if limit.at_most is not None else limit.at_least
-        if bound is not None:
-            of = 'mean' if limit.quantile is None else f'{100.0 * limit.quantile:g} %'
-            axes.axvline(factor * bound, color=COLOURS['limit'], linewidth=1.2)
-            axes.annotate(f'limit of {of}', (factor * bound, 0.94),
-                          xycoords=('data', 'axes fraction'), ha='right', fontsize=7.5,
-                          xytext=(-3, 0), textcoords='offset points', color=COLOURS['limit'])
+        if bound is None:
+            continue
+        of = 'mean' if limit.quantile is None else f'{100.0 * limit.quantile:g} %'
+        text, inside = f'limit of {of}: {factor * bound:.3g}', low < factor * bound < high
+        if inside:
+            axes.axvline(factor * bound, ymax=0.85, color=COLOURS['limit'], linewidth=1.2)
+        # One far off would leave the histogram no room.
+        if factor * bound >= high:
+            text += ' \N{RIGHTWARDS ARROW}'
+        elif not inside:
+            text = '\N{LEFTWARDS ARROW} ' + text
+        left = factor * bound < 0.5 * (low + high)
+        axes.annotate(text, (0.01 if left else 0.99, 0.94), xycoords='axes fraction',
+                      ha='left' if left else 'right', fontsize=8.0, color=COLOURS['limit'])
     axes.set_xlabel(unit)
 
 
@@ -141,7 +157,6 @@ def _scatter(axes: Axes, correlation: Correlation, drawn: Array, values: Array) 
     axes.plot(drawn, factor * values, '.', color=LINK_COLOURS[0], markersize=4.0, alpha=0.6)
     axes.set_title(f'{TITLES[correlation.metric]}   \N{GREEK SMALL LETTER RHO} = '
                    f'{correlation.rho:+.2f}'.replace('-', '\N{MINUS SIGN}'))
-    axes.set_xlabel(correlation.parameter)
     axes.set_ylabel(unit)
     axes.margins(x=0.03)
 
@@ -158,9 +173,8 @@ def _scale(name: str, values: Array) -> tuple[float, str]:
     return factor, prefix + unit
 
 
-def _png(draw: object) -> bytes:
+def _png(draw: Callable[[], Figure]) -> bytes:
     with rc_context(style.RC):
         buffer = io.BytesIO()
-        draw().savefig(buffer, format='png', dpi=DPI,  # type: ignore[operator]
-                       facecolor=COLOURS['paper'])
+        draw().savefig(buffer, format='png', dpi=DPI, facecolor=COLOURS['paper'])
         return buffer.getvalue()
