@@ -30,6 +30,7 @@ from fourbar_ros.mechanism.constants import Array
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 import numpy as np
 
 TITLES = {
@@ -93,7 +94,7 @@ def scatter_png(parameters: Sequence[Parameter], drawn: Mapping[str, Array],
         axes = np.ravel(figure.subplots(rows, COLUMNS))
         for panel, each in zip(axes, shown):
             _scatter(panel, each, drawn[each.parameter], metrics[each.metric])
-            panel.set_xlabel(labels[each.parameter])
+            panel.set_xlabel(labels[each.parameter], fontsize=8.0)
         for panel in axes[len(shown):]:
             panel.set_visible(False)
         figure.suptitle('What the runs depend on most', x=0.01, ha='left', fontsize=10.5,
@@ -150,6 +151,7 @@ def _histogram(axes: Axes, name: str, values: Array, found: Statistics, limits: 
         axes.annotate(text, (0.01 if left else 0.99, 0.94), xycoords='axes fraction',
                       ha='left' if left else 'right', fontsize=8.0, color=COLOURS['limit'])
     axes.set_xlabel(unit)
+    axes.xaxis.set_major_locator(MaxNLocator(6))
 
 
 def _scatter(axes: Axes, correlation: Correlation, drawn: Array, values: Array) -> None:
