@@ -27,7 +27,14 @@ with open(os.path.join(PACKAGE, '__init__.py'), encoding='utf-8') as stream:
 
 EXTRAS = {
     'hardware': ['cantools>=39', 'python-can>=4.3'],
-    'analysis': ['cma>=3.3', 'matplotlib>=3.7', 'rosbags>=0.10', 'tqdm'],
+    'analysis': [
+        'cma>=3.3',
+        'dask[distributed]>=2024.1',
+        'matplotlib>=3.7',
+        'pyarrow>=14',
+        'rosbags>=0.10',
+        'tqdm',
+    ],
     'dev': [
         'colcon-core>=0.15',
         'colcon-library-path',

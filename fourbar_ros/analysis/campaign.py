@@ -18,10 +18,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 import contextlib
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 import os
 import signal
 import threading
@@ -35,6 +35,10 @@ _Found = TypeVar('_Found')
 
 # What tells the usual libraries of linear algebra how many threads to take.
 THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
+
+
+# A process that dies is replaced so often before any work is done again.
+REPLACED = 3
 
 
 class CampaignError(FourbarError):
@@ -58,8 +62,7 @@ def in_processes(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: 
     if jobs == 1 or len(items) < 2:
         yield from map(work, items)
         return
-    # Not by fork: whoever calls may have threads.
-    pool = ProcessPoolExecutor(min(jobs, len(items)), mp_context=get_context('spawn'))
+    pool = _pool(min(jobs, len(items)))
     try:
         with _interrupts_ignored(), _one_thread_each():
             waiting = deque(pool.submit(work, item) for item in items)
@@ -70,6 +73,61 @@ def in_processes(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: 
                             'fewer --jobs') from None
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def as_ready(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: int
+             ) -> Generator[_Found, None, None]:
+    """
+    Do some work for each item as :func:`in_processes`, and return it as soon as it is done.
+
+    Few items are given away beforehand, so there may be any number of them. What a process did
+    that died is done again in another one.
+
+    :returns: what the work returned, in the order in which it was ready.
+    :raises CampaignError: processes died again and again.
+    """
+    if jobs == 1 or len(items) < 2:
+        yield from map(work, items)
+        return
+    waiting, died = deque(items), 0
+    while waiting:
+        running: dict[Future[_Found], _Item] = {}
+        pool = _pool(min(jobs, len(items)))
+        try:
+            while waiting or running:
+                with _interrupts_ignored(), _one_thread_each():
+                    while waiting and len(running) < 2 * jobs:
+                        future = pool.submit(work, waiting[0])
+                        running[future] = waiting.popleft()
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    found = future.result()
+                    del running[future]
+                    died = 0
+                    yield found
+        except BrokenProcessPool:
+            died += 1
+            if died > REPLACED:
+                raise CampaignError('processes of the campaign died, by lack of memory perhaps: '
+                                    'take fewer --jobs') from None
+            waiting.extendleft(reversed(running.values()))
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _pool(jobs: int) -> ProcessPoolExecutor:
+    """Make processes, not by fork: whoever calls may have threads."""
+    return ProcessPoolExecutor(jobs, mp_context=get_context('spawn'), initializer=_end_together)
+
+
+def _end_together() -> None:
+    """Let this process end when its parent is killed, instead of waiting for work for ever."""
+    parent = parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextlib.contextmanager

@@ -27,3 +27,11 @@ def remark(shown: Iterable[Any], text: str) -> None:
     say = getattr(shown, 'set_postfix_str', None)
     if say is not None:
         say(text)
+
+
+def begin_at(shown: Iterable[Any], done: int) -> None:
+    """Let the progress begin with so many steps that were made before, where it is shown."""
+    bar: Any = shown
+    if hasattr(bar, 'initial'):
+        bar.initial = bar.n = done
+        bar.refresh()

@@ -73,7 +73,8 @@ def run(args: argparse.Namespace) -> int:
     text = json.dumps(document, indent=2, allow_nan=False) + '\n'
     files: Mapping[Path, str | bytes] = {
         **{folder / name: content for name, content in result.files.items()},
-        folder / f'{args.name}.json': text, **({args.json: text} if args.json else {})}
+        folder / (result.document or f'{args.name}.json'): text,
+        **({args.json: text} if args.json else {})}
     write_files(files)
 
     print(result.text)

@@ -99,7 +99,8 @@ class Scenario:
     """
     A run of the closed loop.
 
-    :param mechanism_name, table_name, believed_name: presets, or absolute paths of files.
+    :param mechanism_name, table_name, believed_name: presets, absolute paths of files, or '' for
+        what is described in the scenario itself.
     :param mechanism, table: what is in them.
     :param believed: the linkage that estimator and controller believe to have.
     :param initial: where the linkage starts.
@@ -141,7 +142,15 @@ class Scenario:
         return tick_at(seconds, self.plant.period_ns)
 
     def parameters(self) -> dict[str, dict[str, Any]]:
-        """Return the parameters that make nodes run this scenario, by node and name."""
+        """
+        Return the parameters that make nodes run this scenario, by node and name.
+
+        :raises ScenarioError: it describes what nodes take from a file only.
+        """
+        for kind in ('mechanism', 'believed', 'table'):
+            if not getattr(self, f'{kind}_name'):
+                raise ScenarioError(f'{kind} is described in the scenario itself: nodes need a '
+                                    'preset or a file of its own')
         initial = {f'initial.{name}': value for name, value in asdict(self.initial).items()}
         return {
             'plant': {'mechanism': self.mechanism_name, 'table': self.table_name,
@@ -202,17 +211,15 @@ def scenario_from(values: Mapping[str, Any], folder: Path) -> Scenario:
     :raises FourbarError: a key is missing or unknown, or a value is refused.
     """
     check_keys(values, REQUIRED, 'scenario', ScenarioError, optional=OPTIONAL)
-    mechanism_name, table_name = (
-        _file_name(kind, values[kind], folder) for kind in ('mechanism', 'table'))
-    mechanism = load_mechanism(mechanism_name)
+    mechanism_name, mechanism = _mechanism('mechanism', values['mechanism'], folder)
     believed_name, believed = mechanism_name, mechanism
     if 'believed' in values:
-        believed_name = _file_name('believed', values['believed'], folder)
         try:
-            believed = load_mechanism(believed_name)
+            believed_name, believed = _mechanism('believed', values['believed'], folder)
         except FourbarError as error:
             # There are two of its kind: say which.
             raise ScenarioError(f'believed: {error}') from None
+    table_name, table = _table(values['table'], folder)
     initial = _section('initial', InitialState, values)
     plant = _section('plant', PlantSettings, values)
     start = assemble(mechanism, initial.link_a, initial.link_b, initial.branch)
@@ -221,8 +228,7 @@ def scenario_from(values: Mapping[str, Any], folder: Path) -> Scenario:
     if arm_at is not None:
         arm_at = float(_checked('arm_at', arm_at, 0.0, (0.0, duration, 's')))
     return Scenario(
-        mechanism_name, mechanism, believed_name, believed, table_name,
-        load_table(table_name), initial, plant,
+        mechanism_name, mechanism, believed_name, believed, table_name, table, initial, plant,
         _section('estimator', EstimatorSettings, values),
         _section('controller', ControllerSettings, values), arm_at,
         _script(values.get('setpoints', []), start, arm_at, duration, plant.period_ns), duration,
@@ -319,10 +325,27 @@ def _checked(name: str, value: Any, default: Any, allowed: Allowed) -> Any:
     return value if whole else float(value)
 
 
+def _mechanism(kind: str, given: Any, folder: Path) -> tuple[str, Mechanism]:
+    """Return the name, '' without one, and the mechanism that is named or described."""
+    if isinstance(given, Mapping):
+        return '', Mechanism.from_mapping(given, 'mechanism')
+    name = _file_name(kind, given, folder)
+    return name, load_mechanism(name)
+
+
+def _table(given: Any, folder: Path) -> tuple[str, Table]:
+    """Return the name, '' without one, and the table that is named or described."""
+    if isinstance(given, Mapping):
+        return '', Table.from_mapping(given, 'table')
+    name = _file_name('table', given, folder)
+    return name, load_table(name)
+
+
 def _file_name(kind: str, name: Any, folder: Path) -> str:
     """Turn the name of a preset or file in a scenario into one that holds everywhere."""
     if not isinstance(name, str):
-        raise ScenarioError(f'{kind} must be the name of a preset or file, got {name!r}')
+        raise ScenarioError(
+            f'{kind} must be the name of a preset or file, or keys of its own, got {name!r}')
     path = Path(name).expanduser()
     if '/' in name or path.suffix in ('.yaml', '.yml'):
         return str((folder / path).absolute())

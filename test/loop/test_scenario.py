@@ -16,14 +16,16 @@
 
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from math import inf, nan, pi
 from pathlib import Path
 from typing import Any
 
 from fourbar_ros.configuration import ConfigurationError, presets, share_directory
+from fourbar_ros.errors import FourbarError
 from fourbar_ros.loop import load_scenario, Scenario, ScenarioError
-from fourbar_ros.loop.scenario import ALLOWED
+from fourbar_ros.loop.description import describe, load_description
+from fourbar_ros.loop.scenario import ALLOWED, scenario_from
 from fourbar_ros.mechanism import assemble
 from fourbar_ros.nodes.tables import TABLES
 import numpy as np
@@ -341,3 +343,53 @@ def test_table_of_what_is_allowed_is_whole() -> None:
         settings = getattr(scenario, section)
         assert set(ALLOWED[section]) == set(settings.__dataclass_fields__)
     assert np.isfinite(scenario.mechanism.link_lengths).all()
+
+
+def plain(scenario: Scenario) -> dict[str, Any]:
+    """Return what a scenario holds as text that tells any two apart, names of files left out."""
+    def text(value: Any) -> str:
+        return repr({item.name: text(getattr(value, item.name)) for item in fields(value)}
+                    if is_dataclass(value) else
+                    value.tolist() if isinstance(value, np.ndarray) else value)
+    return {item.name: text(getattr(scenario, item.name)) for item in fields(scenario)
+            if not item.name.endswith('_name')}
+
+
+@pytest.mark.parametrize('name', presets('scenario'))
+def test_description_makes_the_same_scenario(name: str) -> None:
+    """Written to YAML and read again it is still the same, whatever the folder."""
+    description = load_description(name)
+    again = scenario_from(yaml.safe_load(yaml.safe_dump(description)), Path('nowhere'))
+    assert plain(again) == plain(load_scenario(name))
+    assert describe(description, Path('nowhere')) == description
+
+
+def test_description_keeps_relative_setpoints_and_what_is_believed(written: Write) -> None:
+    description = load_description(written({**GOOD, 'believed': 'prototype'}))
+    assert description['setpoints'][1]['relative'] == {'link_d': -1}
+    assert description['believed'] != description['mechanism']
+    assert load_description(written(GOOD))['believed'] == description['mechanism']
+
+
+def test_nodes_are_not_given_what_a_scenario_describes_itself() -> None:
+    description = load_description('paper')
+    with pytest.raises(ScenarioError, match='mechanism is described in the scenario itself'):
+        scenario_from(description, Path()).parameters()
+
+
+@pytest.mark.parametrize(('place', 'value', 'told'), [
+    ('mechanism.link_masses', [0.02, 0.02, 0.02, -1.0], 'link_masses of link_d'),
+    ('believed.link_masses', [0.02, 0.02, 0.02, -1.0], 'believed: .*link_masses of link_d'),
+    ('mechanism.weight', 1.0, 'mechanism: unknown weight'),
+    ('table.joints.coulomb', -1.0, 'table: joints.coulomb'),
+])
+def test_what_is_wrong_in_a_described_mechanism_or_table_is_told(
+        place: str, value: Any, told: str) -> None:
+    description = load_description('paper')
+    *sections, name = place.split('.')
+    section: Any = description
+    for key in sections:
+        section = section[key]
+    section[name] = value
+    with pytest.raises(FourbarError, match=told):
+        scenario_from(description, Path())

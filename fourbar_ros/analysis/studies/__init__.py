@@ -44,13 +44,13 @@ class Study:
     :param summary: one line.
     :param options: names of `OPTIONS` that it takes. With `seed` it is given a `sample`, of which
         these are parts; the others it is given by name.
-    :param runs: of each kind, unless told.
+    :param runs: of each kind, unless told; None for one that is given no sample, but all by name.
     :param resumes: whether it is given a `folder`, where it keeps what is finished.
     """
 
     summary: str
     options: tuple[str, ...] = ()
-    runs: int = 100
+    runs: int | None = 100
     resumes: bool = False
 
 
@@ -71,11 +71,15 @@ class Option:
 
 
 OPTIONS = {
+    'campaign': Option('CAMPAIGN', 'preset (prototype) or YAML file', positional=True),
     'runs': Option('N', 'runs of each kind (default as many as the limits are made for: 100, of '
-                   'crossing 300)', int),
+                   'crossing 300, of montecarlo what its campaign says)', int),
     'seed': Option('S', 'of the first run of each kind, the others follow it (default 0)', int),
     'jobs': Option('N', 'processes, which change nothing but the time (default all cores)', int),
     'mechanism': Option('NAME', 'a linkage to look at as well, a preset or a mechanism file'),
+    'scheduler': Option('tcp://HOST:PORT', 'a Dask scheduler whose workers make the runs, instead '
+                        'of processes here'),
+    'only': Option('K', 'make run K again, alone, and print it', int),
 }
 _DRAWN = ('runs', 'seed', 'jobs')
 
@@ -86,6 +90,8 @@ STUDIES = {
     'crossing': Study('change points with four wheels and with two: crossing, parking, turning '
                       'there', _DRAWN, runs=300),
     'cad': Study('section 3, Fig. 3: which defect of a CAD model makes its differences'),
+    'montecarlo': Study('a campaign: closed loops at random over anything of a scenario',
+                        ('campaign', *_DRAWN, 'scheduler', 'only'), runs=None, resumes=True),
     'energy': Study('section 4, Fig. 4: what four wheels save over two, and when not'),
     'inertia': Study('section 4, Fig. 5: a search for wheel inertias, beside the closed form',
                      ('seed', 'jobs'), resumes=True),
@@ -146,6 +152,7 @@ class Result:
     :param text: the same for people, in lines.
     :param files: the content of each file to write, by name.
     :param skipped: what was left out and why, one line each.
+    :param document: name of the JSON file in the folder, '' for that of the study.
     """
 
     checks: Sequence[Check]
@@ -153,6 +160,7 @@ class Result:
     text: str
     files: Mapping[str, str | bytes] = field(default_factory=dict)
     skipped: Sequence[str] = ()
+    document: str = ''
 
 
 def load_study(name: str, folder: Path | None = None, **given: Any
@@ -172,7 +180,7 @@ def load_study(name: str, folder: Path | None = None, **given: Any
     if missing := [written(option) for option in study.options
                    if OPTIONS[option].positional and option not in given]:
         raise StudyError(f'study {name} needs {", ".join(missing)}')
-    if 'seed' in study.options:
+    if 'seed' in study.options and study.runs is not None:
         drawn = {option: given.pop(option) for option in _DRAWN if option in given}
         given['sample'] = Sample(**{'runs': study.runs, **drawn})
     if study.resumes:
