@@ -21,7 +21,7 @@ import signal
 import subprocess
 import sys
 
-from fourbar_ros.analysis.campaign import CampaignError, in_processes
+from fourbar_ros.analysis.campaigns.processes import CampaignError, in_processes
 from fourbar_ros.analysis.consistency import (
     autocorrelation,
     chi_square_bounds,
@@ -228,7 +228,7 @@ def test_process_that_dies_is_told() -> None:
 @pytest.mark.node
 def test_interrupt_of_all_processes_ends_them_without_a_word() -> None:
     code = ('import time\n'
-            'from fourbar_ros.analysis.campaign import in_processes\n'
+            'from fourbar_ros.analysis.campaigns.processes import in_processes\n'
             'if __name__ == "__main__":\n'
             '    try:\n'
             '        for _ in in_processes(time.sleep, [0.2] * 500, 2):\n'

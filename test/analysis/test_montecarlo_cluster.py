@@ -25,11 +25,11 @@ import sys
 import time
 from typing import Any
 
-from fourbar_ros.analysis import campaign_cluster
-from fourbar_ros.analysis.campaign import CampaignError
-from fourbar_ros.analysis.campaign_cluster import on_cluster
-from fourbar_ros.analysis.campaign_file import load_campaign
-from fourbar_ros.analysis.campaign_versions import difference, versions
+from fourbar_ros.analysis.campaigns import cluster as campaign_cluster
+from fourbar_ros.analysis.campaigns.cluster import on_cluster
+from fourbar_ros.analysis.campaigns.file import load_campaign
+from fourbar_ros.analysis.campaigns.processes import CampaignError
+from fourbar_ros.analysis.campaigns.versions import difference, versions
 from fourbar_ros.analysis.studies import montecarlo
 from fourbar_ros.commands.main import main
 import pyarrow.parquet
@@ -230,7 +230,7 @@ def deadly() -> Callable[..., Any]:
     def work(campaign: Any, batch: Any) -> Any:
         import os
 
-        from fourbar_ros.analysis.campaign_run import do_batch
+        from fourbar_ros.analysis.campaigns.run import do_batch
         if 1 in batch:
             os._exit(1)
         return do_batch(campaign, batch)

@@ -20,9 +20,9 @@ from math import exp, inf, log
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.analysis.campaign import CampaignError
-from fourbar_ros.analysis.campaign_file import Campaign, campaign_from, load_campaign
-from fourbar_ros.analysis.campaign_names import names_of, place_of, value_at
+from fourbar_ros.analysis.campaigns.file import Campaign, campaign_from, load_campaign
+from fourbar_ros.analysis.campaigns.names import names_of, place_of, value_at
+from fourbar_ros.analysis.campaigns.processes import CampaignError
 from fourbar_ros.configuration import presets
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.loop import load_scenario

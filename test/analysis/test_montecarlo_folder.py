@@ -26,11 +26,11 @@ import sys
 import time
 from typing import Any
 
-from fourbar_ros.analysis import campaign_folder
-from fourbar_ros.analysis.campaign import as_ready, CampaignError
-from fourbar_ros.analysis.campaign_file import Campaign, load_campaign
-from fourbar_ros.analysis.campaign_folder import CampaignFolder
-from fourbar_ros.analysis.campaign_run import do_run
+from fourbar_ros.analysis.campaigns import folder as campaign_folder
+from fourbar_ros.analysis.campaigns.file import Campaign, load_campaign
+from fourbar_ros.analysis.campaigns.folder import CampaignFolder
+from fourbar_ros.analysis.campaigns.processes import as_ready, CampaignError
+from fourbar_ros.analysis.campaigns.run import do_run
 from fourbar_ros.analysis.progress import begin_at
 from fourbar_ros.analysis.studies import montecarlo, Result, StudyError
 from fourbar_ros.commands.main import main

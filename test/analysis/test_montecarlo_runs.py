@@ -22,9 +22,9 @@ from math import nan
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.analysis.campaign_file import campaign_from, Limit, load_campaign
-from fourbar_ros.analysis.campaign_run import do_run, measure, METRICS, WALL
-from fourbar_ros.analysis.campaign_summary import (
+from fourbar_ros.analysis.campaigns.file import campaign_from, Limit, load_campaign
+from fourbar_ros.analysis.campaigns.run import do_run, measure, METRICS, WALL
+from fourbar_ros.analysis.campaigns.summary import (
     checks_of,
     correlations,
     failure_interval,

@@ -32,7 +32,7 @@ import io
 from math import nan, pi
 from typing import Any, cast
 
-from fourbar_ros.analysis.campaign import in_processes
+from fourbar_ros.analysis.campaigns.processes import in_processes
 from fourbar_ros.analysis.checks import at_least, at_most, Check, finite_or_none, within
 from fourbar_ros.analysis.consistency import autocorrelation, chi_square_bounds, share_inside
 from fourbar_ros.analysis.progress import Progress

@@ -31,7 +31,7 @@ import io
 from math import inf, isfinite, radians
 from typing import Any, cast
 
-from fourbar_ros.analysis.campaign import in_processes
+from fourbar_ros.analysis.campaigns.processes import in_processes
 from fourbar_ros.analysis.checks import at_least, finite_or_none
 from fourbar_ros.analysis.progress import Progress
 from fourbar_ros.analysis.studies import Result, Sample

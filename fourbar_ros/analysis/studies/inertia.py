@@ -32,7 +32,7 @@ from math import degrees, inf, sqrt
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.analysis.campaign import in_processes
+from fourbar_ros.analysis.campaigns.processes import in_processes
 from fourbar_ros.analysis.checks import at_least, at_most, Check, within
 from fourbar_ros.analysis.progress import Progress, remark
 from fourbar_ros.analysis.spending import spend

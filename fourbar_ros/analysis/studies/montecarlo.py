@@ -29,12 +29,12 @@ import io
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.analysis.campaign import as_ready, CampaignError
-from fourbar_ros.analysis.campaign_cluster import on_cluster
-from fourbar_ros.analysis.campaign_file import Campaign, load_campaign
-from fourbar_ros.analysis.campaign_folder import CampaignFolder
-from fourbar_ros.analysis.campaign_run import do_batch, do_run, METRICS, prepared, Row, WALL
-from fourbar_ros.analysis.campaign_summary import (
+from fourbar_ros.analysis.campaigns.cluster import on_cluster
+from fourbar_ros.analysis.campaigns.file import Campaign, load_campaign
+from fourbar_ros.analysis.campaigns.folder import CampaignFolder
+from fourbar_ros.analysis.campaigns.processes import as_ready, CampaignError
+from fourbar_ros.analysis.campaigns.run import do_batch, do_run, METRICS, prepared, Row, WALL
+from fourbar_ros.analysis.campaigns.summary import (
     checks_of,
     Correlation,
     correlations,

@@ -21,10 +21,10 @@ import io
 from math import ceil
 
 from fourbar_ros.analysis import style
-from fourbar_ros.analysis.campaign_draws import Parameter
-from fourbar_ros.analysis.campaign_file import Limit
-from fourbar_ros.analysis.campaign_run import METRICS
-from fourbar_ros.analysis.campaign_summary import Correlation, Statistics
+from fourbar_ros.analysis.campaigns.draws import Parameter
+from fourbar_ros.analysis.campaigns.file import Limit
+from fourbar_ros.analysis.campaigns.run import METRICS
+from fourbar_ros.analysis.campaigns.summary import Correlation, Statistics
 from fourbar_ros.analysis.style import COLOURS, LINK_COLOURS
 from fourbar_ros.mechanism.constants import Array
 from matplotlib import rc_context

@@ -29,7 +29,7 @@ from dataclasses import replace
 import io
 from math import nan
 
-from fourbar_ros.analysis.campaign import in_processes
+from fourbar_ros.analysis.campaigns.processes import in_processes
 from fourbar_ros.analysis.checks import at_most, Check, within
 from fourbar_ros.analysis.progress import Progress
 from fourbar_ros.analysis.studies import cores, Result

@@ -32,9 +32,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.analysis.campaign import CampaignError
-from fourbar_ros.analysis.campaign_file import Campaign
-from fourbar_ros.analysis.campaign_run import METRICS, Row, WALL
+from fourbar_ros.analysis.campaigns.file import Campaign
+from fourbar_ros.analysis.campaigns.processes import CampaignError
+from fourbar_ros.analysis.campaigns.run import METRICS, Row, WALL
 import numpy as np
 import pyarrow as pa
 from pyarrow import parquet

@@ -27,7 +27,7 @@ from difflib import get_close_matches
 import re
 from typing import Any
 
-from fourbar_ros.analysis.campaign import CampaignError
+from fourbar_ros.analysis.campaigns.processes import CampaignError
 
 Place = tuple[str | int, ...]
 """Keys and indices on the way to a value."""

@@ -26,7 +26,7 @@ import fourbar_ros
 
 # What a closed loop without ROS is made of, and what measures it.
 ROOMS = ('control', 'device', 'estimation', 'loop', 'mechanism', 'plant')
-MODULES = ('analysis/campaign_run.py', 'analysis/consistency.py')
+MODULES = ('analysis/campaigns/run.py', 'analysis/consistency.py')
 LIBRARIES = ('numpy', 'scipy', 'numba', 'filterpy')
 
 

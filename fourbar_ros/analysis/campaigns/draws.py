@@ -29,8 +29,8 @@ import json
 from math import exp, isfinite, log
 from typing import Any
 
-from fourbar_ros.analysis.campaign import CampaignError
-from fourbar_ros.analysis.campaign_names import nearest, Place
+from fourbar_ros.analysis.campaigns.names import nearest, Place
+from fourbar_ros.analysis.campaigns.processes import CampaignError
 import numpy as np
 
 KINDS = {

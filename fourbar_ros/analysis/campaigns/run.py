@@ -38,7 +38,7 @@ from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
 if TYPE_CHECKING:
-    from fourbar_ros.analysis.campaign_file import Campaign
+    from fourbar_ros.analysis.campaigns.file import Campaign
 
 Row = dict[str, Any]
 """Number, seed, what was drawn, metrics and fate of a run, by column."""

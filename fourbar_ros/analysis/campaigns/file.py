@@ -25,9 +25,8 @@ from math import isfinite, prod
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.analysis.campaign import CampaignError
-from fourbar_ros.analysis.campaign_draws import combined, distribution, Parameter
-from fourbar_ros.analysis.campaign_names import (
+from fourbar_ros.analysis.campaigns.draws import combined, distribution, Parameter
+from fourbar_ros.analysis.campaigns.names import (
     elements,
     nearest,
     Place,
@@ -35,8 +34,9 @@ from fourbar_ros.analysis.campaign_names import (
     put,
     value_at,
 )
-from fourbar_ros.analysis.campaign_run import METRICS
-from fourbar_ros.analysis.campaign_versions import versions
+from fourbar_ros.analysis.campaigns.processes import CampaignError
+from fourbar_ros.analysis.campaigns.run import METRICS
+from fourbar_ros.analysis.campaigns.versions import versions
 from fourbar_ros.configuration import config_file, load_yaml
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.loop.description import load_description

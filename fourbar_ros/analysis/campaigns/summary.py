@@ -20,8 +20,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import nan, sqrt
 
-from fourbar_ros.analysis.campaign_file import Campaign, FAILURE_RATE, Limit
-from fourbar_ros.analysis.campaign_run import METRICS
+from fourbar_ros.analysis.campaigns.file import Campaign, FAILURE_RATE, Limit
+from fourbar_ros.analysis.campaigns.run import METRICS
 from fourbar_ros.analysis.checks import at_least, at_most, Check
 from fourbar_ros.mechanism.constants import Array
 import numpy as np

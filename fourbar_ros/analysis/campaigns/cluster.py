@@ -29,10 +29,10 @@ from queue import Empty, SimpleQueue
 import time
 from typing import Any
 
-from fourbar_ros.analysis.campaign import CampaignError
-from fourbar_ros.analysis.campaign_file import Campaign
-from fourbar_ros.analysis.campaign_run import do_batch, lost_run, Row
-from fourbar_ros.analysis.campaign_versions import difference, versions
+from fourbar_ros.analysis.campaigns.file import Campaign
+from fourbar_ros.analysis.campaigns.processes import CampaignError
+from fourbar_ros.analysis.campaigns.run import do_batch, lost_run, Row
+from fourbar_ros.analysis.campaigns.versions import difference, versions
 
 # How long to wait for a scheduler, for its first worker, and for one after all have gone [s].
 CONNECTING, FIRST_WORKER, NO_WORKER = 5.0, 15.0, 60.0
@@ -99,7 +99,7 @@ def _asked() -> Callable[[], dict[str, str]]:
     def ask() -> dict[str, str]:
         from importlib import import_module
         try:
-            module = import_module('fourbar_ros.analysis.campaign_versions')
+            module = import_module('fourbar_ros.analysis.campaigns.versions')
         except ImportError:
             return {}
         found: dict[str, str] = module.versions()
