@@ -33,5 +33,5 @@ def begin_at(shown: Iterable[Any], done: int) -> None:
     """Let the progress begin with so many steps that were made before, where it is shown."""
     bar: Any = shown
     if hasattr(bar, 'initial'):
-        bar.initial = bar.n = done
+        bar.initial = bar.n = bar.last_print_n = done
         bar.refresh()

@@ -215,7 +215,7 @@ def test_run_that_kills_workers_is_a_row(
     """Four workers die of run 1; all the others of its batch are made by the fifth."""
     monkeypatch.setattr(campaign_cluster, 'work', deadly())
     made = load_campaign(campaign_file())
-    for _ in range(6):
+    for _ in range(5):
         cluster.worker()
     with contextlib.closing(on_cluster(made, [[0], [1], [2]], cluster.address)) as found:
         rows = {row['run']: row for rows in found for row in rows}

@@ -17,6 +17,7 @@
 from collections.abc import Callable, Iterator
 import errno
 import fcntl
+from io import StringIO
 import json
 import os
 from pathlib import Path
@@ -36,6 +37,7 @@ from fourbar_ros.analysis.studies import montecarlo, Result, StudyError
 from fourbar_ros.commands.main import main
 import pyarrow.parquet
 import pytest
+from tqdm import tqdm
 
 PATIENCE = 60.0
 
@@ -156,7 +158,11 @@ def test_finished_campaign_is_not_run_again_and_takes_more_runs(
         run(path, folder, runs=4)
 
 
-def test_progress_that_is_not_shown_has_no_beginning() -> None:
+def test_progress_begins_with_what_is_done() -> None:
+    bar = tqdm(iter(range(7)), total=10, file=StringIO(), mininterval=0.0, miniters=1)
+    begin_at(bar, 3)
+    assert [bar.n for _ in bar][-1] == 9
+    assert (bar.n, bar.initial) == (10, 3)
     begin_at([1, 2], 1)
 
 

@@ -96,7 +96,7 @@ def as_ready(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: int
         try:
             while waiting or running:
                 with _interrupts_ignored(), _one_thread_each():
-                    while waiting and len(running) < 2 * jobs:
+                    while waiting and len(running) <= jobs:
                         future = pool.submit(work, waiting[0])
                         running[future] = waiting.popleft()
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
