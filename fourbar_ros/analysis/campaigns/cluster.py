@@ -50,7 +50,8 @@ def on_cluster(campaign: Campaign, batches: Sequence[Sequence[int]], address: st
     :param batches: numbers of the runs that are made together.
     :param address: of the scheduler, `tcp://HOST:PORT`.
     :returns: rows of one batch after the other, as they are ready. A run that takes every worker
-        with it on which it is tried has a row that says so.
+        with it on which it is tried has a row that says so; it is tried at last with nothing else
+        on the cluster, since Dask blames all that a dead worker had.
     :raises CampaignError: there is no such scheduler, or not any more; workers have other
         versions; distributed is not installed.
     """
@@ -114,17 +115,22 @@ def _spread(client: Any, address: str, campaign: Campaign, batches: Sequence[Seq
 
     gone = CampaignError(f'the scheduler {address} is gone')
     waiting = deque(tuple(batch) for batch in batches)
+    suspects: deque[int] = deque()
+    alone = False
     running: dict[Any, tuple[int, ...]] = {}
     ready: SimpleQueue[Any] = SimpleQueue()
     seen = time.monotonic()
     try:
-        while waiting or running:
+        while waiting or running or suspects:
             threads = sum(client.nthreads().values())
             if threads:
                 seen = time.monotonic()
             elif time.monotonic() - seen > NO_WORKER:
                 raise CampaignError(f'the scheduler {address} has had no workers for '
                                     f'{NO_WORKER:g} s')
+            if suspects and not waiting and not running:
+                alone = True
+                waiting.append((suspects.popleft(),))
             while waiting and len(running) < AHEAD * max(threads, 1):
                 batch = waiting.popleft()
                 future = client.submit(work, campaign, batch, pure=False)
@@ -135,9 +141,8 @@ def _spread(client: Any, address: str, campaign: Campaign, batches: Sequence[Seq
                 try:
                     yield future.result()
                 except distributed.KilledWorker:
-                    if len(batch) > 1:
-                        # Which of them it was shows when each is alone.
-                        waiting.extendleft((run,) for run in reversed(batch))
+                    if not alone:
+                        suspects.extend(batch)
                     else:
                         yield [lost_run(campaign, batch[0], 'every worker that took it died, by '
                                                             'lack of memory perhaps')]
