@@ -189,15 +189,16 @@ def test_clock_topic_rises_slowly_enough_and_stamps_follow_it(nodes, clock):
     assert arrays[-1].header.stamp.sec < 10 ** 6
 
 
-def test_fast_clock_passes_as_many_times_as_fast(nodes):
-    """Within the tenth that a busy machine may lag, at half of what two cores can keep up with."""
-    _, testbed, _ = nodes('plant', clock='fast', real_time_factor=2.0)
+def test_fast_clock_passes_faster_than_real_time_and_leaves_out_no_tick(nodes):
+    """How many times as fast is told by test_pacing; here a busy machine may lag, and catch up."""
+    namespace, testbed, _ = nodes('plant', clock='fast', real_time_factor=2.0)
     testbed.wait(lambda: len(testbed.received['flywheel_states']) >= 10)
     begin = testbed.node.get_clock().now().nanoseconds
     ticks = stamps(testbed.more('flywheel_states', 1000))
     elapsed = testbed.node.get_clock().now().nanoseconds - begin
-    assert ticks == list(range(ticks[0], ticks[0] + 1000 * PERIOD_NS, PERIOD_NS))
-    assert 1000 * PERIOD_NS / elapsed == pytest.approx(2.0, rel=0.1)
+    assert ticks == sorted(ticks)
+    assert 1.0 < (ticks[-1] - ticks[0]) / elapsed < 2.5
+    assert_no_tick_is_missing(testbed, f'{namespace[1:]}/plant')
 
 
 def test_real_time_has_no_clock_topic(nodes):
