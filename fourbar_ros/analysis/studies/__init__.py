@@ -23,7 +23,8 @@ is finished in its folder.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
@@ -161,6 +162,15 @@ class Result:
     files: Mapping[str, str | bytes] = field(default_factory=dict)
     skipped: Sequence[str] = ()
     document: str = ''
+
+
+@contextmanager
+def figures(skipped: list[str]) -> Iterator[None]:
+    """Let a study draw, or say in what it skipped which library is missing for that."""
+    try:
+        yield
+    except ImportError as error:
+        skipped.append(f'no figure: {error.name} is missing')
 
 
 def load_study(name: str, folder: Path | None = None, **given: Any

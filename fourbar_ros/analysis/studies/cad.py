@@ -33,7 +33,7 @@ from typing import Any
 
 from fourbar_ros.analysis.checks import at_most, Check, finite_or_none
 from fourbar_ros.analysis.progress import Progress
-from fourbar_ros.analysis.studies import Result
+from fourbar_ros.analysis.studies import figures, Result
 from fourbar_ros.analysis.studies.cad_defects import defective, DEFECTS
 from fourbar_ros.analysis.studies.validation import FREQUENCY_HZ, PAPER_TESTS
 from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism
@@ -139,12 +139,10 @@ def run(progress: Progress) -> Result:
     starts = {start: _from_start(np.radians(start)) for start in START_THETAS}
     files: dict[str, str | bytes] = {
         'cad.csv': _curves_csv(curves), 'cad_pairs.csv': _pairs_csv(pairs)}
-    skipped = []
-    try:
+    skipped: list[str] = []
+    with figures(skipped):
         from fourbar_ros.analysis.studies.cad_figure import png
         files['cad.png'] = png(curves, pairs, best, twice)
-    except ImportError as error:
-        skipped.append(f'no figure: {error.name} is missing')
     return Result(_checks(best, twice), _data(curves, pairs, best, twice, starts),
                   _table(curves, pairs, twice, starts), files, skipped)
 

@@ -32,7 +32,7 @@ from typing import Any
 
 from fourbar_ros.analysis.checks import at_most, Check, finite_or_none, within
 from fourbar_ros.analysis.progress import Progress
-from fourbar_ros.analysis.studies import Result
+from fourbar_ros.analysis.studies import figures, Result
 from fourbar_ros.mechanism import load_mechanism, Mechanism, reduced_form
 from fourbar_ros.mechanism.closure import BRANCHES
 from fourbar_ros.mechanism.conditioning import Conditioning, conditioning_grid, WHEELS
@@ -120,15 +120,13 @@ def run(progress: Progress, mechanism: str | None = None) -> Result:
         looks.append(_look(Path(str(mechanism)).stem, given, AROUND, BRANCHES))
         files['conditioning_linkage.csv'] = _looks_csv(looks)
     spans = {name: [span(SIGNS[name], theta) for theta in SPAN_THETAS] for name in SIGNS}
-    skipped = []
-    try:
+    skipped: list[str] = []
+    with figures(skipped):
         from fourbar_ros.analysis.studies.conditioning_figure import looks_png, png
         files['conditioning.png'] = png(grids)
         files['conditioning_hidden.png'] = looks_png(hidden)
         if looks:
             files['conditioning_linkage.png'] = looks_png(looks)
-    except ImportError as error:
-        skipped.append(f'no figure: {error.name} is missing')
     return Result(_checks(grids, seconds), _data(spans, seconds, looks), _table(spans, looks),
                   files, skipped)
 

@@ -36,7 +36,7 @@ from fourbar_ros.analysis.campaigns.processes import in_processes
 from fourbar_ros.analysis.checks import at_least, at_most, Check, finite_or_none, within
 from fourbar_ros.analysis.consistency import autocorrelation, chi_square_bounds, share_inside
 from fourbar_ros.analysis.progress import Progress
-from fourbar_ros.analysis.studies import Result, Sample
+from fourbar_ros.analysis.studies import figures, Result, Sample
 from fourbar_ros.analysis.studies.consistency_runs import bound_of, follow, FREE, LAGS, Tally
 from fourbar_ros.estimation import STATE_NAMES
 from fourbar_ros.loop import load_scenario, Scenario
@@ -213,12 +213,10 @@ def run(progress: Progress, sample: Sample) -> Result:
                 tallies.append(tally)
     outcomes = [Outcome(case, tally) for case, tally in zip(chosen, tallies)]
     files: dict[str, str | bytes] = {'consistency.csv': _csv(outcomes)}
-    skipped = []
-    try:
+    skipped: list[str] = []
+    with figures(skipped):
         from fourbar_ros.analysis.studies.consistency_figure import png
         files['consistency.png'] = png(outcomes)
-    except ImportError as error:
-        skipped.append(f'no figure: {error.name} is missing')
     data = {'runs': sample.runs, 'seed': sample.seed,
             'cases': {outcome.case.name: _data(outcome) for outcome in outcomes}}
     return Result(checks(outcomes), data, _table(outcomes), files, skipped)

@@ -34,7 +34,7 @@ from typing import Any, cast
 from fourbar_ros.analysis.campaigns.processes import in_processes
 from fourbar_ros.analysis.checks import at_least, finite_or_none
 from fourbar_ros.analysis.progress import Progress
-from fourbar_ros.analysis.studies import Result, Sample
+from fourbar_ros.analysis.studies import figures, Result, Sample
 from fourbar_ros.analysis.studies.crossing_runs import Crossing, go, METHODS, Passage, Run
 from fourbar_ros.loop.warm_up import warm_up
 from fourbar_ros.mechanism.constants import Array
@@ -145,12 +145,10 @@ def run(progress: Progress, sample: Sample) -> Result:
                        100.0 * counted[name, 'four_held'].passed / sample.runs, '%', LEAST_PASSED)
               for name in CROSSINGS]
     files: dict[str, str | bytes] = {'crossing.csv': _csv(counted, of_map)}
-    skipped = []
-    try:
+    skipped: list[str] = []
+    with figures(skipped):
         from fourbar_ros.analysis.studies.crossing_figure import png
         files['crossing.png'] = png(counted, of_map)
-    except ImportError as error:
-        skipped.append(f'no figure: {error.name} is missing')
     data = {'runs': sample.runs, 'seed': sample.seed,
             'crossings': {name: {method: _data(counted[name, method]) for method in METHODS}
                           for name in CROSSINGS},

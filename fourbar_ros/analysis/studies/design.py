@@ -30,7 +30,7 @@ from typing import Any
 from fourbar_ros.analysis.checks import at_most, Check, within
 from fourbar_ros.analysis.progress import Progress
 from fourbar_ros.analysis.spending import spend, Spending
-from fourbar_ros.analysis.studies import Result
+from fourbar_ros.analysis.studies import figures, Result
 from fourbar_ros.control.feasibility import shortest_duration, Wheels
 from fourbar_ros.control.reference import SoftStep
 from fourbar_ros.control.setpoint import SetpointError
@@ -179,12 +179,10 @@ def run(progress: Progress) -> Result:
         'sizes': [design.as_json() for design in sizes],
         'ratios': [design.as_json() for design in ratios]}
     files: dict[str, str | bytes] = {'design.csv': _csv(sizes, ratios)}
-    skipped = []
-    try:
+    skipped: list[str] = []
+    with figures(skipped):
         from fourbar_ros.analysis.studies.design_figure import png
         files['design.png'] = png(sizes, ratios, present, answer)
-    except ImportError as error:
-        skipped.append(f'no figure: {error.name} is missing')
     return Result(_checks(present, answer, looped, table), data,
                   _text(present, answer, data), files, skipped)
 

@@ -31,7 +31,7 @@ from typing import Any
 from fourbar_ros.analysis.checks import at_least, at_most, Check, within
 from fourbar_ros.analysis.progress import Progress
 from fourbar_ros.analysis.spending import spend, Spending
-from fourbar_ros.analysis.studies import Result
+from fourbar_ros.analysis.studies import figures, Result
 from fourbar_ros.control.allocation import mobilities
 from fourbar_ros.control.reference import SoftStep
 from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism
@@ -104,12 +104,10 @@ def run(progress: Progress) -> Result:
         'four_wheels': totals['whole']['four_wheels'], 'ratios_four_to_two': ratios,
         'manoeuvres': totals}
     files: dict[str, str | bytes] = {'energy.csv': _csv(found)}
-    skipped = []
-    try:
+    skipped: list[str] = []
+    with figures(skipped):
         from fourbar_ros.analysis.studies.energy_figure import png
         files['energy.png'] = png(found)
-    except ImportError as error:
-        skipped.append(f'no figure: {error.name} is missing')
     return Result(_checks(found, totals, ratios), data, _table(totals), files, skipped)
 
 

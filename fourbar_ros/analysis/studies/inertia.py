@@ -36,7 +36,7 @@ from fourbar_ros.analysis.campaigns.processes import in_processes
 from fourbar_ros.analysis.checks import at_least, at_most, Check, within
 from fourbar_ros.analysis.progress import Progress, remark
 from fourbar_ros.analysis.spending import spend
-from fourbar_ros.analysis.studies import Result, Sample, StudyError
+from fourbar_ros.analysis.studies import figures, Result, Sample, StudyError
 from fourbar_ros.analysis.studies.inertia_search import (
     Candidate,
     decode,
@@ -147,12 +147,10 @@ def run(progress: Progress, sample: Sample, folder: Path | None) -> Result:
     best = best_of(found)
     paper = _paper_inertias()
     files: dict[str, str | bytes] = {'inertia.csv': _csv(found)}
-    skipped = []
-    try:
+    skipped: list[str] = []
+    with figures(skipped):
         from fourbar_ros.analysis.studies.inertia_figure import png
         files['inertia.png'] = png(found, best)
-    except ImportError as error:
-        skipped.append(f'no figure: {error.name} is missing')
     data = {'seed': sample.seed, 'best': best.as_json(), 'paper_inertias': paper,
             'searches': [each.as_json() for each in found]}
     return Result(_checks(found, best), data, _table(found, best, paper), files, skipped)

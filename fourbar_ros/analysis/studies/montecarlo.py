@@ -46,7 +46,7 @@ from fourbar_ros.analysis.campaigns.summary import (
 )
 from fourbar_ros.analysis.checks import finite_or_none
 from fourbar_ros.analysis.progress import begin_at, Progress
-from fourbar_ros.analysis.studies import cores, Result, Sample, StudyError
+from fourbar_ros.analysis.studies import cores, figures, Result, Sample, StudyError
 from fourbar_ros.loop.scenario import scenario_from
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
@@ -153,16 +153,14 @@ def _result(campaign: Campaign, table: pa.Table, with_time: pa.Table) -> Result:
         'mean_wall_s_per_run': finite_or_none(statistics(walls).mean)}
     files: dict[str, str | bytes] = {
         'summary.csv': _summary_csv(described), 'correlations.csv': _correlations_csv(strongest)}
-    skipped = []
-    try:
+    skipped: list[str] = []
+    with figures(skipped):
         from fourbar_ros.analysis.studies.montecarlo_figure import distributions_png, scatter_png
         files['montecarlo.png'] = distributions_png(metrics, described, campaign.limits,
                                                     len(reasons))
         if strongest:
             files['montecarlo_parameters.png'] = scatter_png(
                 campaign.parameters, drawn, metrics, strongest)
-    except ImportError as error:
-        skipped.append(f'no figure: {error.name} is missing')
     return Result(checks_of(campaign.limits, metrics, len(reasons)), data,
                   _text_of(data, described, strongest), files, skipped)
 

@@ -32,7 +32,7 @@ from math import nan
 from fourbar_ros.analysis.campaigns.processes import in_processes
 from fourbar_ros.analysis.checks import at_most, Check, within
 from fourbar_ros.analysis.progress import Progress
-from fourbar_ros.analysis.studies import cores, Result
+from fourbar_ros.analysis.studies import cores, figures, Result
 from fourbar_ros.analysis.studies.crossing import CROSSINGS
 from fourbar_ros.analysis.studies.crossing_runs import go, Passage, Run
 from fourbar_ros.control.axes import hold_on_branch
@@ -122,12 +122,10 @@ def run(progress: Progress) -> Result:
                   link_torques=TORQUE * joint_motor(0)))}
     expected = 0.5 * TORQUE / eta_inertia(mechanism, 0.0) * DRIVEN_FOR ** 2
     files: dict[str, str | bytes] = {'singularity.csv': _csv(numbers)}
-    skipped = []
-    try:
+    skipped: list[str] = []
+    with figures(skipped):
         from fourbar_ros.analysis.studies.singularity_figure import png
         files['singularity.png'] = png(numbers, parked)
-    except ImportError as error:
-        skipped.append(f'no figure: {error.name} is missing')
     data = {
         'generalized_forces': {name: _forces(drive) for name, drive in DRIVES.items()},
         'rank_at_0': {name: rank(driven(mechanism, 0.0, drive)) for name, drive in DRIVES.items()},

@@ -26,7 +26,7 @@ from typing import Any
 
 from fourbar_ros.analysis.checks import at_most, Check, within
 from fourbar_ros.analysis.progress import Progress
-from fourbar_ros.analysis.studies import Result, StudyError
+from fourbar_ros.analysis.studies import figures, Result, StudyError
 from fourbar_ros.analysis.studies.comparison import compare, Comparison, OURS, STEP, Trial
 from fourbar_ros.configuration import share_directory
 from fourbar_ros.mechanism import angular_momentum, closure_error, load_mechanism, Mechanism
@@ -65,11 +65,9 @@ def run(progress: Progress) -> Result:
     """
     comparisons, rules, skipped = compare(trials(), progress)
     files: dict[str, str | bytes] = {'validation.csv': _csv(comparisons, rules)}
-    try:
+    with figures(skipped):
         from fourbar_ros.analysis.studies.validation_figure import png
         files['validation.png'] = png(comparisons[:len(PAPER_TESTS)])
-    except ImportError as error:
-        skipped.append(f'no figure: {error.name} is missing')
     return Result(checks(comparisons), _data(comparisons, rules), _table(comparisons, rules),
                   files, skipped)
 
