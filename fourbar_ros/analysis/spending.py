@@ -34,7 +34,9 @@ from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix
-from fourbar_ros.mechanism.forces import forces_along
+from fourbar_ros.mechanism.forces import forces_along, NOTHING
+from fourbar_ros.mechanism.layout import LINK_ANGLES
+from fourbar_ros.mechanism.motion import advance_state
 from fourbar_ros.plant import Table
 from fourbar_ros.plant.bearings import bearing_torque, drives_of
 from fourbar_ros.plant.table import surroundings_of
@@ -187,3 +189,21 @@ def spend(mechanism: Mechanism, way: Way, present: Array, mobilities: Array,
         bearings[:] = [[bearing_torque(speed, 0.0, drives) for speed in four]
                        for four in relative.tolist()]
     return Spending(mechanism, times, angles, link_rates, torques, absolute, bearings)
+
+
+def fly(mechanism: Mechanism, state: Array, torques: Array, step: float) -> Array:
+    """
+    Let torques drive the linkage through the integrator, without friction.
+
+    :param state: at the begin, see mechanism.layout; not changed.
+    :param torques: (2 m + 1, 4) on the wheels, at the begin, middle and end of m steps [N m].
+    :param step: [s].
+    :returns: (m + 1, 4) link angles at the begin and after each step [rad].
+    """
+    state = state.copy()
+    angles = [state[LINK_ANGLES].copy()]
+    for n in range(0, len(torques) - 2, 2):
+        advance_state(state, torques[n], torques[n + 1], torques[n + 2], step,
+                      mechanism.constants, NOTHING)
+        angles.append(state[LINK_ANGLES].copy())
+    return np.array(angles)

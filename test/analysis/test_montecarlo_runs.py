@@ -27,9 +27,9 @@ from fourbar_ros.analysis.campaigns.run import do_run, measure, METRICS, WALL
 from fourbar_ros.analysis.campaigns.summary import (
     checks_of,
     correlations,
-    failure_interval,
     statistics,
 )
+from fourbar_ros.analysis.shares import share_interval
 from fourbar_ros.analysis.studies import montecarlo
 from fourbar_ros.commands.main import main
 from fourbar_ros.loop import load_scenario, record_run
@@ -216,7 +216,7 @@ def test_interval_of_the_mean_covers_it_as_often_as_it_says() -> None:
 @pytest.mark.parametrize(('failed', 'runs'), [(0, 30), (3, 30), (30, 30)])
 def test_interval_of_failures_is_clopper_and_pearsons(failed: int, runs: int) -> None:
     """At either end, so many failures or more, or fewer, have the probability 2.5 %."""
-    low, high = failure_interval(failed, runs)
+    low, high = share_interval(failed, runs)
     if failed:
         assert binom.sf(failed - 1, runs, low) == pytest.approx(0.025)
     if failed < runs:

@@ -25,7 +25,7 @@ from fourbar_ros.analysis.campaigns.run import METRICS
 from fourbar_ros.analysis.checks import at_least, at_most, Check
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
-from scipy.stats import beta, rankdata
+from scipy.stats import rankdata
 from scipy.stats import t as student
 
 CONFIDENCE = 0.95
@@ -84,14 +84,6 @@ def statistics(values: Array) -> Statistics:
     half = float(student.ppf(0.5 + 0.5 * CONFIDENCE, n - 1)) * std / sqrt(n) if n > 1 else nan
     return Statistics(n, mean, std, mean - half, mean + half,
                       tuple(float(each) for each in np.quantile(known, QUANTILES)))
-
-
-def failure_interval(failed: int, runs: int) -> tuple[float, float]:
-    """Return the 95 % confidence interval of a share (Clopper and Pearson 1934)."""
-    tail = 0.5 * (1.0 - CONFIDENCE)
-    low = float(beta.ppf(tail, failed, runs - failed + 1)) if failed else 0.0
-    high = float(beta.ppf(1.0 - tail, failed + 1, runs - failed)) if failed < runs else 1.0
-    return low, high
 
 
 def correlations(parameters: Mapping[str, Array], metrics: Mapping[str, Array]

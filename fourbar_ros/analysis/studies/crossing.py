@@ -34,12 +34,12 @@ from typing import Any, cast
 from fourbar_ros.analysis.campaigns.processes import in_processes
 from fourbar_ros.analysis.checks import at_least, finite_or_none
 from fourbar_ros.analysis.progress import Progress
+from fourbar_ros.analysis.shares import share_interval
 from fourbar_ros.analysis.studies import figures, Result, Sample
 from fourbar_ros.analysis.studies.crossing_runs import Crossing, go, METHODS, Passage, Run
 from fourbar_ros.loop.warm_up import warm_up
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
-from scipy.stats import beta
 
 # So many of a hundred runs of four wheels with feedback must pass.
 LEAST_PASSED = 99.0
@@ -100,10 +100,7 @@ class Tally:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % confidence interval of the share that passes (Clopper and Pearson 1934)."""
-        passed, failed = self.passed, self.runs - self.passed
-        low = float(beta.ppf(0.025, passed, failed + 1)) if passed else 0.0
-        high = float(beta.ppf(0.975, passed + 1, failed)) if failed else 1.0
-        return low, high
+        return share_interval(self.passed, self.runs)
 
     @property
     def reasons(self) -> dict[str, int]:

@@ -30,15 +30,13 @@ from typing import Any
 
 from fourbar_ros.analysis.checks import at_least, at_most, Check, within
 from fourbar_ros.analysis.progress import Progress
-from fourbar_ros.analysis.spending import spend, Spending
+from fourbar_ros.analysis.spending import fly, spend, Spending
 from fourbar_ros.analysis.studies import figures, Result
 from fourbar_ros.control.allocation import mobilities
 from fourbar_ros.control.reference import SoftStep
 from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism
 from fourbar_ros.mechanism.constants import Array
-from fourbar_ros.mechanism.forces import NOTHING
-from fourbar_ros.mechanism.layout import LINK_ANGLES, make_state
-from fourbar_ros.mechanism.motion import advance_state
+from fourbar_ros.mechanism.layout import make_state
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
@@ -191,12 +189,9 @@ def flown(spending: Spending) -> float:
     """
     # Every second instant is the middle of a step of the integrator.
     state = make_state(spending.angles[0], spending.link_rates[0], spending.speeds[0])
-    constants, torques, worst = spending.mechanism.constants, spending.torques, 0.0
-    step = float(spending.times[2] - spending.times[0])
-    for n in range(0, len(torques) - 2, 2):
-        advance_state(state, torques[n], torques[n + 1], torques[n + 2], step, constants, NOTHING)
-        worst = max(worst, float(np.abs(state[LINK_ANGLES] - spending.angles[n + 2]).max()))
-    return worst
+    angles = fly(spending.mechanism, state, spending.torques,
+                 float(spending.times[2] - spending.times[0]))
+    return float(np.abs(angles - spending.angles[::2]).max())
 
 
 def _checks(found: Mapping[str, Mapping[str, Spending]], totals: Mapping[str, Any],

@@ -35,7 +35,7 @@ from typing import Any
 from fourbar_ros.analysis.campaigns.processes import in_processes
 from fourbar_ros.analysis.checks import at_least, at_most, Check, within
 from fourbar_ros.analysis.progress import Progress, remark
-from fourbar_ros.analysis.spending import spend
+from fourbar_ros.analysis.spending import fly, spend
 from fourbar_ros.analysis.studies import figures, Result, Sample, StudyError
 from fourbar_ros.analysis.studies.inertia_search import (
     Candidate,
@@ -45,15 +45,14 @@ from fourbar_ros.analysis.studies.inertia_search import (
     least_at_error,
     POLYNOMIALS,
     Search,
+    SOFT_STEP,
     TURN,
 )
 from fourbar_ros.control.allocation import mobilities
 from fourbar_ros.control.reference import SoftStep
 from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism
 from fourbar_ros.mechanism.constants import Array
-from fourbar_ros.mechanism.forces import NOTHING
-from fourbar_ros.mechanism.layout import LINK_ANGLES, make_state
-from fourbar_ros.mechanism.motion import advance_state
+from fourbar_ros.mechanism.layout import make_state
 import numpy as np
 
 # Weights of the tracking error along the front, and the one of searches that differ in their seed.
@@ -179,15 +178,11 @@ def flown(candidate: Candidate) -> float:
     shares = np.linspace(0.0, 1.0, 2 * STEPS + 1)
     slopes = np.array([speed.deriv()(shares) for speed in POLYNOMIALS])
     torques = -inertias * unit / DURATION * (candidate.coefficients @ slopes).T
-    state = make_state(assemble(nominal, 0.0, np.pi / 3.0))
-    begin, step, errors = state[LINK_ANGLES].copy(), DURATION / STEPS, [0.0]
-    reference = TURN * (10.0 * shares ** 3 - 15.0 * shares ** 4 + 6.0 * shares ** 5)
-    for n in range(0, 2 * STEPS, 2):
-        advance_state(state, torques[n], torques[n + 1], torques[n + 2], step, nominal.constants,
-                      NOTHING)
-        turned = state[LINK_ANGLES] - begin
-        errors.append(float(((turned - reference[n + 2]) ** 2).mean()))
-    return abs(sqrt(float(np.trapezoid(errors)) / STEPS) - candidate.error_rms)
+    angles = fly(nominal, make_state(assemble(nominal, 0.0, np.pi / 3.0)), torques,
+                 DURATION / STEPS)
+    errors = angles - angles[0] - TURN * SOFT_STEP(shares[::2])[:, None]
+    squared = float(np.trapezoid((errors ** 2).mean(axis=1))) / STEPS
+    return abs(sqrt(squared) - candidate.error_rms)
 
 
 def _kept(search: Search, folder: Path | None) -> tuple[list[float], int]:

@@ -38,7 +38,6 @@ from fourbar_ros.analysis.campaigns.summary import (
     checks_of,
     Correlation,
     correlations,
-    failure_interval,
     numeric_columns,
     QUANTILES,
     Statistics,
@@ -46,6 +45,7 @@ from fourbar_ros.analysis.campaigns.summary import (
 )
 from fourbar_ros.analysis.checks import finite_or_none
 from fourbar_ros.analysis.progress import begin_at, Progress
+from fourbar_ros.analysis.shares import share_interval
 from fourbar_ros.analysis.studies import cores, figures, Result, Sample, StudyError
 from fourbar_ros.loop.scenario import scenario_from
 from fourbar_ros.mechanism.constants import Array
@@ -139,7 +139,7 @@ def _result(campaign: Campaign, table: pa.Table, with_time: pa.Table) -> Result:
     reasons = [reason for reason in table['failure'].to_pylist() if reason]
     described = {name: statistics(values) for name, values in metrics.items()}
     strongest = correlations(drawn, metrics)
-    low, high = failure_interval(len(reasons), len(table))
+    low, high = share_interval(len(reasons), len(table))
     walls = _column(with_time, WALL)
     data = {
         'runs': len(table), 'seed': campaign.seed, 'campaign_hash': campaign.hash,
