@@ -23,6 +23,7 @@ from fourbar_ros.nodes.environment import RosError
 from fourbar_ros.nodes.experiment import Experiment
 from fourbar_ros.nodes.messages import RELIABLE, stamp_of
 from fourbar_ros.nodes.priority import go_first
+from fourbar_ros.nodes.runtime import deliver
 import numpy as np
 from sensor_msgs.msg import JointState
 
@@ -137,5 +138,6 @@ class DrivenExperiment(Experiment):
                            'itself') from None
         finally:
             runtime.stopping = stopping
+            deliver([self._commands])
             self.node.destroy_publisher(self._commands)
             self._commands = None

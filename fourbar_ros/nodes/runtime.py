@@ -143,19 +143,19 @@ def run_node(make_node, name, description, argv):
     finally:
         if node is not None:
             node.close()
-            _deliver(node)
+            deliver(node.publishers)
         runtime.shut_down(node)
     return 0
 
 
-def _deliver(node):
+def deliver(publishers):
     """
     Wait until every reliable subscriber has what was published, the last zero torque above all.
 
     What is still under way when its publisher ends is lost.
     """
     end = time.monotonic() + LAST_WORDS
-    for publisher in node.publishers:
+    for publisher in publishers:
         publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
 
 

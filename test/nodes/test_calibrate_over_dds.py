@@ -37,6 +37,7 @@ def plant(module_suite, probe):
     probe.newest('flywheel_states')
     probe.status('device_status', state='disarmed')
     probe.unfollow()
+    probe.follow('flywheel_command')
     return probe
 
 
@@ -45,7 +46,15 @@ def start(plant, module_suite):
     """Return a function that starts the command, with the plant at rest and disarmed."""
     assert plant.trigger('sim/reset').success
     plant.status('device_status', state='disarmed')
+    plant.catch_up()
+    plant.received['flywheel_command'].clear()
     return lambda *arguments: module_suite.start('calibrate', *arguments)
+
+
+def wait_for_torque(plant):
+    """Wait until a wheel is driven."""
+    commands = plant.received['flywheel_command']
+    plant.wait(lambda: any(any(command.effort) for command in commands))
 
 
 def check_left_without_torque(plant):
@@ -78,8 +87,6 @@ def test_one_wheel(start, plant, tmp_path):
     So short a coast-down tells the friction at its speeds. How that divides is known to half a
     percent of Coulomb friction only, so of these alone four standard errors are borne.
     """
-    plant.follow('flywheel_command')
-    plant.catch_up()
     made, numbers, again, bag, report = (tmp_path / name for name in (
         'mechanism.yaml', 'wheels.json', 'again.json', 'bag', 'report.yaml'))
     process = start(*WHEELS, '-o', str(made), '--json', str(numbers), '--record', str(bag),
@@ -105,7 +112,7 @@ def test_one_wheel(start, plant, tmp_path):
 
 def test_device_that_is_disarmed_meanwhile_ends_it(start, plant):
     process = start(*WHEELS)
-    plant.status('device_status', state='armed')
+    wait_for_torque(plant)
     plant.arm(False)
     assert process.end() == 2
     assert 'the device does not drive any more: disarmed (disarmed on request)' in process.stderr
@@ -114,10 +121,7 @@ def test_device_that_is_disarmed_meanwhile_ends_it(start, plant):
 
 def test_interrupt_leaves_the_wheels_without_torque(start, plant):
     process = start(*WHEELS)
-    plant.status('device_status', state='armed')
-    driven = plant.received['flywheel_command']
-    begin = len(driven)
-    plant.wait(lambda: any(any(command.effort) for command in driven[begin:]))
+    wait_for_torque(plant)
     assert process.end(signal.SIGINT) == 130
     assert process.stderr.splitlines()[-1] == 'fourbar calibrate: interrupted'
     plant.status('device_status', state='disarmed')
@@ -129,15 +133,13 @@ def test_linkage_that_comes_near_a_change_point_ends_it_and_leaves_no_recording(
     bag, parameter = tmp_path / 'bag', Parameter(name='initial.link_b')
     parameter.value.type = ParameterType.PARAMETER_DOUBLE
     # Where this reset takes it, and those of other tests.
-    for angle in (0.22, float(np.pi / 3.0)):
+    for angle in (0.24, float(np.pi / 3.0)):
         parameter.value.double_value = angle
         result, = plant.call(SetParameters, 'plant/set_parameters',
                              SetParameters.Request(parameters=[parameter])).results
         assert result.successful
-        if angle == 0.22:
+        if angle == 0.24:
             assert plant.trigger('sim/reset').success
-    plant.follow('flywheel_command')
-    plant.catch_up()
     process = start('links', '--yes', '--record', str(bag))
     assert process.end() == 2
     assert 'deg of a line, limit 10.0 deg: begin farther' in process.stderr.splitlines()[-1]
