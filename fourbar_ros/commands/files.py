@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import tempfile
@@ -84,6 +84,28 @@ def check_new_folder(folder: Path) -> None:
         raise OutputError(f'cannot make {folder}: {parent} is not a directory')
     if not os.access(parent, os.W_OK | os.X_OK):
         raise OutputError(f'cannot make {folder}: {parent} is not writable')
+
+
+@contextmanager
+def kept_folder(folder: Path) -> Iterator[None]:
+    """
+    Make a folder if it is missing, and its parents; if nothing comes of it, not even those stay.
+
+    :raises OutputError: it cannot be made.
+    """
+    path = folder.absolute()
+    missing = [above for above in (path, *path.parents) if not above.exists()]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f'cannot make {folder}: {error.strerror}') from None
+    try:
+        yield
+    except BaseException:
+        for made in missing:
+            with suppress(OSError):
+                made.rmdir()    # one that holds something stays
+        raise
 
 
 @contextmanager

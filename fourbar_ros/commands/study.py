@@ -51,22 +51,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study, print and write what it found."""
     from fourbar_ros.analysis.checks import checks_as_json, print_checks
-    from fourbar_ros.commands.files import OutputError, write_files
+    from fourbar_ros.commands.files import kept_folder, OutputError, write_files
     from fourbar_ros.commands.progress import show_progress
     from fourbar_ros.mechanism.compiled import announced
 
     folder = args.output or Path(f'study_{args.name}')
     study = load_study(args.name, folder, **{
         name: value for name in OPTIONS if (value := getattr(args, name)) is not None})
-    # Before the work, not after it.
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f'cannot make {folder}: {error.strerror}') from None
     if args.json and not args.json.absolute().parent.is_dir():
         raise OutputError(f'cannot write {args.json}: no such folder')
-
-    with announced():
+    # Made before the work, not after it.
+    with kept_folder(folder), announced():
         result = study(show_progress)
     document = {'study': args.name, 'checks': checks_as_json(result.checks),
                 'skipped': list(result.skipped), **result.data}

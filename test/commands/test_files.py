@@ -20,7 +20,7 @@ import stat
 import tempfile
 from typing import Any
 
-from fourbar_ros.commands.files import OutputError, whole_folder, write_whole
+from fourbar_ros.commands.files import kept_folder, OutputError, whole_folder, write_whole
 import pytest
 
 
@@ -154,3 +154,17 @@ def test_folder_that_is_there_is_kept(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match='No space'), whole_folder(tmp_path / 'out'):
         raise OSError(28, 'No space left on device')
     assert not os.listdir(tmp_path)
+
+
+def test_folder_of_which_nothing_comes_does_not_stay(tmp_path: Path) -> None:
+    (tmp_path / 'there').mkdir()
+    with pytest.raises(KeyboardInterrupt), kept_folder(tmp_path / 'there' / 'deep' / 'folder'):
+        raise KeyboardInterrupt
+    assert not list((tmp_path / 'there').iterdir())
+    with pytest.raises(OutputError), kept_folder(tmp_path / 'there' / 'deep' / 'folder'):
+        (tmp_path / 'there' / 'deep' / 'half').write_text('done')
+        raise OutputError
+    assert [path.name for path in (tmp_path / 'there').glob('**/*')] == ['deep', 'half']
+    with kept_folder(tmp_path / 'empty'):
+        pass
+    assert (tmp_path / 'empty').is_dir()

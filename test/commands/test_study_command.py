@@ -186,6 +186,15 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert out == ''
     assert err.startswith(f'fourbar study: {complaint}')
     assert len(err.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ['file']
+
+
+def test_study_that_refuses_leaves_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(['study', 'montecarlo', 'atlantis', '-o', str(tmp_path / 'deep' / 'folder')]) == 2
+    assert capsys.readouterr().err.startswith("fourbar study: no campaign 'atlantis'")
+    assert not list(tmp_path.iterdir())
 
 
 def test_help_lists_the_studies_and_needs_no_heavy_library() -> None:
