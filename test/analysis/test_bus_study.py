@@ -14,14 +14,16 @@
 
 """The study of the bus, for two seconds."""
 
-from fourbar_ros.analysis.studies.bus import run
+from fourbar_ros.analysis.studies import bus
 import pytest
 
 pytestmark = pytest.mark.node
 
 
-def test_nothing_is_lost_in_two_seconds() -> None:
-    result = run(lambda items, _: items, seconds=2)
+def test_nothing_is_lost_in_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever it takes: how long that is depends on the machine, and is what the study tells."""
+    monkeypatch.setattr(bus, 'ANSWER_TIMEOUT_S', 5.0)
+    result = bus.run(lambda items, _: items, seconds=2)
     assert result.data['ticks'] == 500
     # Heartbeats and clocks come beside twelve frames a tick; a sample in a hundred is left out.
     assert result.data['frames_received'] > 0.97 * 12 * 500

@@ -27,16 +27,18 @@ from math import sqrt
 # What the oscillators of two boards may differ by, to begin with [s/s], and how fast that wanders
 # with temperature [s/s per sqrt(s)].
 DRIFT, WANDER = 1e-4, 1e-7
-# How well a way there and back is halved at best [s]: the two directions differ.
-FLOOR = 2e-5
+# How well a way there and back is halved at best [s], and as a share of the shortest: the two
+# directions differ. With this share an exchange that was slow one way only, and so is wrong by
+# half of its time, stays within the gate: it is never taken for another clock.
+FLOOR, SKEW = 2e-5, 0.1
 # A longer round trip than this says nothing that is worth having [s].
 LONGEST_ROUND_TRIP = 0.05
-# Exchanges after which stamps are to be trusted.
-ENOUGH = 4
+# Exchanges after which stamps are to be trusted, and the standard deviation [s].
+ENOUGH, SURE = 4, 3e-4
 # Beyond so many standard deviations, so many times in a row, it is another clock: it started anew.
 GATE, ANOTHER_CLOCK = 6.0, 5
 # With which means of what is left are taken, and the shortest round trip is forgotten.
-SMOOTHING, FORGETTING = 0.05, 1.01
+SMOOTHING, FORGETTING = 0.05, 1.002
 
 
 class LinkClock:
@@ -45,11 +47,14 @@ class LinkClock:
 
     :ivar exchanges: number of those that counted, since the clock last began.
     :ivar restarts: how often it was another clock.
+    :ivar settled: whether its times are to be trusted; once they are they stay so, until it is
+        another clock.
     """
 
     def __init__(self) -> None:
         self.exchanges = 0
         self.restarts = 0
+        self.settled = False
         self._refused = 0
         self._host_ns = 0
         self._link_us = 0
@@ -59,11 +64,6 @@ class LinkClock:
         self._p00, self._p01, self._p11 = 0.0, 0.0, 0.0
         self._shortest = LONGEST_ROUND_TRIP
         self._residual = 0.0
-
-    @property
-    def settled(self) -> bool:
-        """Whether its times are to be trusted."""
-        return self.exchanges >= ENOUGH
 
     @property
     def jitter(self) -> float:
@@ -92,8 +92,9 @@ class LinkClock:
         if not 0.0 <= round_trip <= LONGEST_ROUND_TRIP:
             return False
         middle_ns = (sent_ns + received_ns) // 2
-        self._shortest = min(round_trip, self._shortest * FORGETTING)
-        noise = FLOOR + 0.5 * (round_trip - self._shortest)
+        shortest = self._shortest * FORGETTING
+        self._shortest = min(round_trip, shortest)
+        noise = FLOOR + SKEW * self._shortest + 0.5 * (round_trip - self._shortest)
         if not self.exchanges:
             self._begin(middle_ns, link_us, noise)
             return True
@@ -102,6 +103,8 @@ class LinkClock:
             return False
         offset = self._offset + elapsed * self._drift
         p00 = self._p00 + elapsed * (2.0 * self._p01 + elapsed * self._p11) + 1e-14 * elapsed
+        # Those before, all slower, may all have been wrong by half of what they took longer.
+        p00 += (0.5 * (shortest - self._shortest)) ** 2
         p01 = self._p01 + elapsed * self._p11
         p11 = self._p11 + WANDER * WANDER * elapsed
         # How far the link is ahead of where its clock would be at the host's pace.
@@ -111,7 +114,6 @@ class LinkClock:
             self._refused += 1
             if self._refused >= ANOTHER_CLOCK:
                 self.restarts += 1
-                self.exchanges = 0
                 self._begin(middle_ns, link_us, noise)
             return False
         self._refused = 0
@@ -127,6 +129,7 @@ class LinkClock:
         self._link_us += ahead_us + whole
         self._host_ns = middle_ns
         self.exchanges += 1
+        self.settled |= self.exchanges >= ENOUGH and self.sigma <= SURE
         return True
 
     def host_ns(self, link_us: int) -> int:
@@ -152,4 +155,4 @@ class LinkClock:
         self._host_ns, self._link_us = host_ns, link_us
         self._offset = self._drift = self._residual = 0.0
         self._p00, self._p01, self._p11 = noise * noise, 0.0, DRIFT * DRIFT
-        self._refused, self.exchanges = 0, 1
+        self._refused, self.exchanges, self.settled = 0, 1, False

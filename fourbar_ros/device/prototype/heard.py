@@ -153,6 +153,7 @@ class HeardLink:
         if not self.clock.settled:
             # Nobody knows yet when that was.
             self.counts['before_clock'] += 1
+            self._angle_sequence = report.sequence
             return
         measured_ns = self._measured_ns(report.time_us, report.wrap_us, arrival_ns)
         assert measured_ns is not None

@@ -66,6 +66,43 @@ def test_clock_of_another_start_is_taken_up() -> None:
     assert abs(clock.host_ns(link_us(now_ns, 0.5, 2e-5)) - now_ns) < 100_000
 
 
+@pytest.mark.parametrize('slow_s', [5e-4, 1e-3, 4e-3, 2e-2])
+@pytest.mark.parametrize('way', ['there', 'back'])
+def test_delay_of_one_way_is_not_taken_for_another_clock(slow_s: float, way: str) -> None:
+    """Ten seconds of it; nothing tells it from a clock that is behind or ahead by half of it."""
+    clock, rng = LinkClock(), np.random.default_rng(0)
+    now_ns = exchanges(clock, rng, 300, 3e-5, 1e-5)
+    worst_s = 0.0
+    for step in range(300):
+        there, back = 6e-5 + rng.exponential(1e-5, 2)
+        slow = slow_s * (step < 156)
+        there, back = there + slow * (way == 'there'), back + slow * (way == 'back')
+        at_ns = now_ns + round(there * 1e9)
+        clock.exchange(now_ns, at_ns + round(back * 1e9), link_us(at_ns, 77.0, 3e-5))
+        worst_s = max(worst_s, abs(
+            clock.host_ns(link_us(now_ns, 77.0, 3e-5)) - now_ns) * 1e-9)
+        now_ns += STEP_NS
+    assert clock.restarts == 0
+    assert clock.settled
+    assert worst_s < 1e-4
+
+
+@pytest.mark.parametrize('way', [0.0, 1.0])
+def test_slow_beginning_is_neither_trusted_nor_another_clock(way: float) -> None:
+    """The shortest round trip says little as long as none was short."""
+    clock, now_ns = LinkClock(), START_NS
+    for round_trip_s in (0.04, 0.03, 0.03, 0.03, 0.02):
+        at_ns = now_ns + round(way * round_trip_s * 1e9)
+        clock.exchange(now_ns, now_ns + round(round_trip_s * 1e9), link_us(at_ns, 77.0, 0.0))
+        now_ns += STEP_NS
+    assert clock.exchanges == 5
+    assert not clock.settled
+    now_ns = exchanges(clock, np.random.default_rng(0), 100, 0.0, 1e-5, begin_ns=now_ns)
+    assert clock.restarts == 0
+    assert clock.settled
+    assert abs(clock.host_ns(link_us(now_ns, 77.0, 0.0)) - now_ns) < 50_000
+
+
 def test_one_lying_exchange_is_left_out() -> None:
     clock, rng = LinkClock(), np.random.default_rng(0)
     now_ns = exchanges(clock, rng, 100, 2e-5, 1e-4)
