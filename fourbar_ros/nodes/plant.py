@@ -63,7 +63,8 @@ class PlantNode(device_node.DeviceNode):
             self._lockstep = Lockstep(
                 self, self._pace, guard, round(values['guard_timeout'] * 1e9), self._on_hindrance,
                 self.advance)
-        if values['clock'] != 'realtime':
+        self.simulated = values['clock'] != 'realtime'
+        if self.simulated:
             self._simulated_clock = SimulatedClock(self, self._pace, guard)
         SimServices(self, self._pace, guard, self._lockstep)
 

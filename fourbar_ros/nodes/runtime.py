@@ -46,13 +46,10 @@ class Runtime:
     ROS of one process: context, executor, and signals that only raise a flag.
 
     rclpy's own signal handling ends the context before anybody can send a last zero torque.
-
-    :param real_time: ask for real-time priority once everything is set up.
     """
 
-    def __init__(self, ros_args=(), real_time=False):
+    def __init__(self, ros_args=()):
         self.stopping = False
-        self._real_time = real_time
         self.failure = None
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._stop)
@@ -75,17 +72,18 @@ class Runtime:
                 return args[1] if len(args) > 1 else None
         return guarded
 
-    def spin(self, work=None):
+    def spin(self, work=None, real_time=False):
         """
         Run callbacks until a signal or a failure; raises the failure.
 
         :param work: called again and again instead, by a node that lets ROS have its turn itself.
+        :param real_time: ask for real-time priority.
         """
         # What lives until the end need not be searched for garbage: with all that numba and
         # matplotlib leave behind, one full search takes longer than several ticks.
         gc.collect()
         gc.freeze()
-        if self._real_time:
+        if real_time:
             go_first()
         while not self.stopping and self.failure is None:
             if work is None:
@@ -113,7 +111,8 @@ def run_node(make_node, name, description, argv):
     Run one node until a signal.
 
     :param make_node: called with the runtime, returns a node with a `close()`, and with a `work()`
-        where it does not live on callbacks.
+        where it does not live on callbacks, and `simulated` where its time is, whatever its
+        parameter use_sim_time says.
     :param argv: what follows the executable's name.
     :returns: exit code.
     :raises RosError: bad arguments or no usable ROS.
@@ -129,14 +128,16 @@ def run_node(make_node, name, description, argv):
     except Exception as error:  # noqa: BLE001 - rcl's errors have no common class
         raise RosError(_first_line(error)) from None
     parser.parse_args(ros_free)
-    runtime = Runtime(argv, real_time=True)
+    runtime = Runtime(argv)
     node = None
     try:
         # Every kernel is compiled while the node is made, none while it runs.
         with announced():
             node = make_node(runtime)
         runtime.executor.add_node(node)
-        runtime.spin(getattr(node, 'work', None))
+        # Simulated time waits; nodes that go as fast as they can would leave others no processor.
+        simulated = getattr(node, 'simulated', node.get_parameter('use_sim_time').value)
+        runtime.spin(getattr(node, 'work', None), real_time=not simulated)
     except (InvalidNamespaceException, InvalidNodeNameException, InvalidTopicNameException,
             ParameterException) as error:
         raise RosError(_first_line(error)) from None

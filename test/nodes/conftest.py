@@ -335,11 +335,15 @@ class Probe:
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
 
-    def wait(self, condition, seconds=DEADLINE_S):
-        """Run callbacks until a condition holds, and return what it returned."""
+    def wait(self, condition, seconds=DEADLINE_S, instead=lambda: ''):
+        """
+        Run callbacks until a condition holds, and return what it returned.
+
+        :param instead: tells what is so if it does not.
+        """
         end = time.monotonic() + seconds
         while not (result := condition()):
-            assert time.monotonic() < end, 'it did not happen in time'
+            assert time.monotonic() < end, f'it did not happen in time {instead()}'
             self._executor.spin_once(timeout_sec=0.02)
         return result
 
@@ -388,7 +392,8 @@ class Probe:
         """Follow a latched status until it has some values, and return all of them."""
         received = self.follow(topic, kind=DiagnosticStatus, qos=LATCHED)
         self.catch_up()
-        self.wait(lambda: received and wanted.items() <= values_of(received[-1]).items())
+        self.wait(lambda: received and wanted.items() <= values_of(received[-1]).items(),
+                  instead=lambda: [values_of(message) for message in received[-3:]])
         return values_of(received[-1])
 
     def state(self):
