@@ -113,7 +113,9 @@ class Lookout:
         if not link.clock.settled:
             told.append('its clock is not known yet')
         if link.state not in (LinkState.IDLE, LinkState.COASTING, None):
-            told.append(f'its electronics say {link.state.name.lower()}')
+            way_out = (', call reset_emergency_stop first'
+                       if link.state is LinkState.STOPPED else '')
+            told.append(f'its electronics say {link.state.name.lower()}{way_out}')
         limit = self._table['wheel_speed_to_arm'].limit
         if abs(link.wheel_speed) > limit:
             told.append(f'its wheel turns at {abs(link.wheel_speed):.3g} rad/s, limit {limit:g}')

@@ -48,6 +48,7 @@ from fourbar_ros.device.prototype.messages import (
     FrameError,
     Heartbeat,
     Limits,
+    LinkState,
     MotorReport,
     Release,
     Stop,
@@ -182,18 +183,19 @@ class Prototype(Device):
             raise
 
     def gate_changed(self, state: DeviceState) -> None:
-        """Stop or release the links at once, and remember how they are when they are armed."""
-        was, self._state = self._state, state
+        """Stop the links at once, and remember how they are when they are armed."""
+        self._state = state
         self._lookout.gate_changed(state, self._steady_ns())
+        if state is DeviceState.EMERGENCY_STOP:
+            self._send_if_there(Stop())
+
+    def release(self) -> Sequence[str]:
+        """Release all links; tell which of them say that they are stopped."""
+        self._send_if_there(Release())
         if self._bus is None:
-            return
-        try:
-            if state is DeviceState.EMERGENCY_STOP:
-                self._send(Stop())
-            elif was is DeviceState.EMERGENCY_STOP:
-                self._send(Release())
-        except BusError:
-            self._lose_bus()
+            return []
+        return [name for name, link in zip(LINK_NAMES, self.links)
+                if link.state is LinkState.STOPPED]
 
     def obstacles(self) -> Sequence[str]:
         """Tell what speaks against arming: links, wheels, clocks, and what must not go on."""
@@ -340,6 +342,15 @@ class Prototype(Device):
         assert self._bus is not None
         for frame in self._codec.to_links(message):
             self._bus.send(frame)
+
+    def _send_if_there(self, message: Stop | Release) -> None:
+        """Send it where there is a bus; the next step tells that there is none any more."""
+        if self._bus is None:
+            return
+        try:
+            self._send(message)
+        except BusError:
+            self._lose_bus()
 
     def _lose_bus(self) -> None:
         bus, self._bus = self._bus, None

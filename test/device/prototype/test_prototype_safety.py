@@ -331,6 +331,38 @@ def test_stop_frame_of_anybody_stops_the_links(driven) -> None:
     assert_coasting(driven)
 
 
+def test_links_that_somebody_else_stopped_are_released_by_a_reset(world) -> None:
+    """As by a host before this one, or where the release was lost."""
+    world.wire.send(world.codec.to_links(Stop())[0])
+    world.run(0.1)
+    assert world.testbed.gate.state is DeviceState.DISARMED
+    armed, reason = world.arm()
+    assert not armed
+    assert 'link_c: its electronics say stopped, call reset_emergency_stop first' in reason
+    assert world.testbed.reset() == (
+        True, 'link_a, link_b, link_c, link_d: the emergency stop is reset')
+    world.run(0.1)
+    assert [firmware(world, link).state for link in range(4)] == [LinkState.IDLE] * 4
+    assert world.arm() == (True, 'armed')
+
+
+def test_links_stay_no_longer_stopped_than_until_a_reset_reaches_them(driven) -> None:
+    driven.testbed.emergency_stop('test')
+    driven.run(0.1)
+    driven.wire.broken = True
+    driven.testbed.reset()
+    with pytest.raises(BusError):
+        driven.tick()
+    assert driven.testbed.gate.state is DeviceState.FAULT
+    driven.wire.broken = False
+    driven.testbed.reset()
+    driven.run(0.3)
+    assert firmware(driven, 0).state is LinkState.STOPPED
+    driven.testbed.reset()
+    driven.run(0.3)
+    assert driven.arm() == (True, 'armed')
+
+
 def test_flood_of_foreign_frames_does_not_hold_the_host_up(driven) -> None:
     for _ in range(5000):
         driven.wire.inject(Frame(0x7FF, b'?'))
