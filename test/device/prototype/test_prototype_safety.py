@@ -267,8 +267,36 @@ def test_frames_that_are_no_good_are_ignored_and_counted(driven, trouble) -> Non
     facts = driven.prototype.facts()
     counted = facts.get('frames_foreign') if trouble == 'foreign' else facts['link_a.replayed']
     assert counted > 500
+    assert facts.get('link_a.lost_heartbeats', 0) == 0
     assert 'frames a second are no good, limit 20' in driven.prototype.diagnosis()['bus']
     assert driven.samples[-1].wheels.efforts == pytest.approx(TORQUE, rel=1e-3)
+
+
+def test_heartbeats_of_the_past_keep_no_link_alive(driven) -> None:
+    beats = [driven.codec.to_host(Heartbeat(
+        1, sequence, LinkState.ARMED, frozenset(), 12.0, 30.0,
+        driven.prototype.links[1].heartbeat.boot))[0]
+        for sequence in ((driven.prototype.links[1].heartbeat.sequence - back) % 16
+                         for back in (1, 2))]
+    driven.wire.emulators[0].trouble('link_b', 'silent')
+
+    def stopped() -> bool:
+        for frame in beats:
+            driven.wire.inject(frame)
+        return driven.testbed.gate.state is DeviceState.EMERGENCY_STOP
+    wait(driven, stopped, 0.6)
+    assert 'link_b: no heartbeat for' in driven.testbed.gate.reason
+
+
+def test_heartbeats_count_on_after_a_long_silence(driven) -> None:
+    """Whatever their number is by then."""
+    for seconds in (1.2, 1.25, 1.3, 1.4, 1.6):
+        driven.wire.emulators[0].trouble('link_b', 'silent')
+        driven.run(seconds)
+        driven.wire.emulators[0].trouble('link_b', '')
+        driven.testbed.reset()
+        driven.run(0.3)
+        assert driven.arm() == (True, 'armed')
 
 
 def test_old_command_does_not_move_a_wheel(driven) -> None:
