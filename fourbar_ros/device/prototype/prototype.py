@@ -74,16 +74,7 @@ LAST_WORDS = 3
 
 
 class Bus(Protocol):
-    """
-    What sends and receives frames; times are of the host's steady clock [ns].
-
-    :ivar sent, received, errors, dropped: number of frames.
-    """
-
-    sent: int
-    received: int
-    errors: int
-    dropped: int
+    """What sends and receives frames; times are of the host's steady clock [ns]."""
 
     @property
     def trouble(self) -> str | None:
@@ -103,6 +94,9 @@ class Bus(Protocol):
         :returns: the frame and when it arrived, None if none came in time.
         :raises BusError: the bus is gone.
         """
+
+    def facts(self) -> dict[str, object]:
+        """Tell what a person wants to know of it, the number of frames above all."""
 
     def close(self) -> None:
         """Leave the bus."""
@@ -223,8 +217,7 @@ class Prototype(Device):
         """Tell counters of the bus, and of each link its health and its clock."""
         told: dict[str, object] = {}
         if self._bus is not None:
-            told = {f'frames_{kind}': getattr(self._bus, kind)
-                    for kind in ('sent', 'received', 'errors', 'dropped')}
+            told = self._bus.facts()
         told.update({f'frames_{kind}': count for kind, count in sorted(self._counts.items())})
         for name, link in zip(LINK_NAMES, self.links):
             beat = link.heartbeat

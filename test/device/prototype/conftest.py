@@ -60,9 +60,6 @@ class Wire:
     trouble: str | None = None
     said: deque[Frame] = field(default_factory=lambda: deque(maxlen=1000))
     sent: int = 0
-    received: int = 0
-    errors: int = 0
-    dropped: int = 0
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(1))
     _number: count[int] = field(default_factory=count)
     _to_links: list[tuple[int, int, Frame]] = field(default_factory=list)
@@ -112,6 +109,10 @@ class Wire:
     def inject(self, frame: Frame) -> None:
         """Let somebody say something to the host."""
         self._push(self._to_host, frame, self.now_ns)
+
+    def facts(self) -> dict[str, object]:
+        """Tell how much was said."""
+        return {'frames_sent': self.sent}
 
     def close(self) -> None:
         """Leave it as it is."""
