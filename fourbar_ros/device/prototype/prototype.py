@@ -69,6 +69,9 @@ MOST_FRAMES = 2000
 # Counters of frames that are no good, whose sum per second is watched.
 BAD = ('length', 'checksum', 'value', 'replayed', 'late', 'wrong_time', 'foreign')
 
+# While a gone bus keeps an emergency stop company, it is opened again at most so often [ns].
+RETRY_NS = 1_000_000_000
+
 # How often the last command is repeated when the host leaves.
 LAST_WORDS = 3
 
@@ -131,6 +134,9 @@ class Prototype(Device):
         self._codec = codec
         self._open_bus = open_bus
         self._bus: Bus | None = open_bus()
+        # When it may be opened again, if that has failed.
+        self._retry_ns: int | None = None
+        self._refusal = ''
         self._steady_ns = steady_ns
         self._stamp_of = stamp_of
         self._answer_timeout_ns = round(answer_timeout_s * 1e9)
@@ -147,10 +153,11 @@ class Prototype(Device):
         """
         Ask the wheels, take along what else was said, and look whether all is well.
 
-        :raises BusError: the bus is gone; the next step tries to open it again.
+        :raises BusError: the bus is gone; it is tried to be opened again at the next step after
+            the gate has changed, and now and then.
         """
         if self._bus is None:
-            self._bus = self._open_bus()
+            self._bus = self._opened_again()
         try:
             round_trip_ns = self._ask(drive)
         except BusError:
@@ -179,6 +186,7 @@ class Prototype(Device):
     def gate_changed(self, state: DeviceState) -> None:
         """Stop the links at once, and remember how they are when they are armed."""
         self._state = state
+        self._retry_ns = None
         self._lookout.gate_changed(state, self._steady_ns())
         if state is DeviceState.EMERGENCY_STOP:
             self._send_if_there(Stop())
@@ -344,6 +352,22 @@ class Prototype(Device):
             self._send(message)
         except BusError:
             self._lose_bus()
+
+    def _opened_again(self) -> Bus:
+        """
+        Open the bus, but do not live for that: it may take a while.
+
+        :raises BusError: it is not there, or was not a moment ago.
+        """
+        begin_ns = self._steady_ns()
+        if self._retry_ns is not None and begin_ns < self._retry_ns:
+            raise BusError(self._refusal)
+        try:
+            return self._open_bus()
+        except BusError as error:
+            self._refusal, end_ns = str(error), self._steady_ns()
+            self._retry_ns = end_ns + max(RETRY_NS, 10 * (end_ns - begin_ns))
+            raise
 
     def _lose_bus(self) -> None:
         bus, self._bus = self._bus, None

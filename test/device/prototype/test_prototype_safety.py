@@ -194,6 +194,28 @@ def test_bus_that_is_gone_is_a_fault_and_comes_back(driven) -> None:
     assert driven.arm() == (True, 'armed')
 
 
+def test_bus_that_is_gone_during_a_stop_is_not_opened_at_every_tick(driven) -> None:
+    """To open one may take seconds, in which nobody would be heard."""
+    driven.testbed.emergency_stop('test')
+    driven.wire.broken = True
+    tried_ns: list[int] = []
+
+    def open_bus():
+        tried_ns.append(driven.wire.now_ns)
+        return driven.open_bus()
+    driven.prototype._open_bus = open_bus
+    for _ in range(625):
+        with pytest.raises(BusError):
+            driven.tick()
+    assert len(tried_ns) == 3
+    assert min(np.diff(tried_ns)) >= 1_000_000_000
+    driven.wire.broken = False
+    driven.testbed.reset()
+    driven.tick()
+    driven.run(0.3)
+    assert driven.testbed.gate.state is DeviceState.DISARMED
+
+
 def test_emergency_stop_latches_in_the_links_too(driven) -> None:
     driven.testbed.emergency_stop('test')
     driven.run(0.01)
