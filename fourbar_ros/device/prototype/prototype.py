@@ -72,6 +72,8 @@ BAD = ('length', 'checksum', 'value', 'replayed', 'late', 'wrong_time', 'foreign
 # While a gone bus keeps an emergency stop company, it is opened again at most so often [ns].
 RETRY_NS = 1_000_000_000
 
+NO_RATE = 'its angles come without a rate, so none is taken: it has no gyro, set gyro to false'
+
 # How often the last command is repeated when the host leaves.
 LAST_WORDS = 3
 
@@ -135,6 +137,7 @@ class Prototype(Device):
         self._open_bus = open_bus
         self._bus: Bus | None = open_bus()
         # When it may be opened again, if that has failed.
+        self._rateless: set[str] = set()
         self._retry_ns: int | None = None
         self._refusal = ''
         self._steady_ns = steady_ns
@@ -201,7 +204,8 @@ class Prototype(Device):
 
     def obstacles(self) -> Sequence[str]:
         """Tell what speaks against arming: links, wheels, clocks, and what must not go on."""
-        return self._lookout.obstacles()
+        return [*(f'{name}: {NO_RATE}' for name in sorted(self._rateless)),
+                *self._lookout.obstacles()]
 
     def findings(self) -> Sequence[Finding]:
         """Tell what was found at the last step that must have consequences."""
@@ -217,6 +221,7 @@ class Prototype(Device):
         if missing := [name for name, link in zip(LINK_NAMES, self.links)
                        if link.heartbeat_ns is None]:
             told['missing'] = f'waiting for {", ".join(missing)}: never heard'
+        told.update(dict.fromkeys(sorted(self._rateless), NO_RATE))
         for where, text in self._lookout.troubles().items():
             told[where] = '; '.join(filter(None, (told.get(where), text)))
         return told
@@ -387,7 +392,9 @@ class Prototype(Device):
                 rates = np.empty(0)
                 if self.measures_rates:
                     if rate is None:
+                        self._rateless.add(name)
                         continue
+                    self._rateless.discard(name)
                     rates = np.array([rate])
                 readings.append(SensorReading(
                     measured_ns + shift_ns, (name,),

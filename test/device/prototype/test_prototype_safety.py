@@ -194,6 +194,16 @@ def test_bus_that_is_gone_is_a_fault_and_comes_back(driven) -> None:
     assert driven.arm() == (True, 'armed')
 
 
+def test_links_without_gyros_are_told_where_there_should_be_some(world) -> None:
+    world.prototype.measures_rates = True
+    world.run(0.3)
+    assert not any(samples.links for samples in world.samples[-50:])
+    armed, reason = world.arm()
+    assert not armed
+    assert 'link_d: its angles come without a rate' in reason
+    assert 'set gyro to false' in world.prototype.diagnosis()['link_a']
+
+
 def test_bus_that_is_gone_during_a_stop_is_not_opened_at_every_tick(driven) -> None:
     """To open one may take seconds, in which nobody would be heard."""
     driven.testbed.emergency_stop('test')
