@@ -161,6 +161,7 @@ class Prototype(Device):
         """
         if self._bus is None:
             self._bus = self._opened_again()
+        self._drive = drive
         try:
             round_trip_ns = self._ask(drive)
         except BusError:

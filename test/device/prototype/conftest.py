@@ -131,7 +131,8 @@ class World:
     """
 
     def __init__(self, codec: Codec | None = None, links: tuple[int, ...] = (0, 1, 2, 3),
-                 table: str = 'prototype') -> None:
+                 table: str = 'prototype',
+                 settings: TestbedSettings | None = None) -> None:
         self.codec = codec or DbcCodec('prototype')
         self.wire = Wire()
         self.samples: list[Samples] = []
@@ -140,7 +141,7 @@ class World:
         self.prototype = Prototype(
             mechanism, self.open_bus, self.codec, load_safety('prototype'), PERIOD_NS, 2e-3,
             False, lambda: self.wire.now_ns, self.stamp_of)
-        self.testbed = Testbed(self.prototype, TestbedSettings())
+        self.testbed = Testbed(self.prototype, settings or TestbedSettings())
         self.command: Callable[[], None] | None = None
         self._ticks = 0
 

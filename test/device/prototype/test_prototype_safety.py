@@ -16,7 +16,7 @@
 
 from pathlib import Path
 
-from fourbar_ros.device import DeviceState
+from fourbar_ros.device import DeviceState, TestbedSettings
 from fourbar_ros.device.prototype.messages import (
     BusError,
     Command,
@@ -90,6 +90,27 @@ def test_link_in_trouble_ends_it(driven, trouble, state, within, word) -> None:
     driven.wire.emulators[0].trouble('link_c', '')
     driven.run(1.5)
     assert driven.arm() == (True, 'armed')
+
+
+@pytest.mark.parametrize(('trouble', 'state'), [
+    ('silent', DeviceState.DISARMED), ('hot', DeviceState.DISARMED),
+    ('reboot', DeviceState.EMERGENCY_STOP)])
+def test_wheels_that_are_parked_under_power_are_watched_too(make_world, trouble, state) -> None:
+    # Before the links coast by themselves.
+    world = make_world(settings=TestbedSettings(
+        command_timeout_s=0.05, timeout_action='hold_speed'))
+    world.run(1.0)
+    world.torque(*TORQUE)
+    assert world.arm() == (True, 'armed')
+    world.run(0.2)
+    world.command = None
+    world.run(0.2)
+    assert world.testbed.gate.state is DeviceState.DISARMED
+    assert all(firmware(world, link).drive()[2] for link in range(4))
+    world.wire.emulators[0].trouble('link_b', trouble)
+    world.run(0.4)
+    assert world.testbed.gate.state is state
+    assert_coasting(world)
 
 
 def test_heartbeat_lost_while_armed_is_an_emergency_stop(driven) -> None:
