@@ -26,7 +26,7 @@ with open(os.path.join(PACKAGE, '__init__.py'), encoding='utf-8') as stream:
     VERSION = re.search(r"^__version__ = '(.+)'$", stream.read(), re.MULTILINE).group(1)
 
 EXTRAS = {
-    'hardware': ['cantools>=39', 'python-can>=4.3'],
+    'hardware': ['cantools>=39', 'msgpack>=1', 'pyserial>=3.4', 'python-can>=4.3'],
     'analysis': [
         'cma>=3.3',
         'dask[distributed]>=2024.1',

@@ -151,6 +151,14 @@ class Device(Protocol):
         """Learn that the wheels may be driven now, or not any more, and why."""
         return
 
+    def release(self) -> Sequence[str]:
+        """
+        Let go of what the device holds by itself, whoever stopped it; asked for while disarmed.
+
+        :returns: names of what was held.
+        """
+        return ()
+
     def obstacles(self) -> Sequence[str]:
         """Tell what speaks against arming now."""
         return ()

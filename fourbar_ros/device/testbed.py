@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from fourbar_ros.device.command import drive_by_name
-from fourbar_ros.device.gate import ArmingGate
+from fourbar_ros.device.gate import ArmingGate, DeviceState
 from fourbar_ros.device.protocol import Device, Drive, no_torque, Reaction, Samples
 from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism.by_name import RejectedError
@@ -214,9 +214,19 @@ class Testbed:
         self._gate_changed()
 
     def reset(self) -> tuple[bool, str]:
-        """Release emergency stop or fault; the wheels stay disarmed."""
+        """
+        Release emergency stop or fault, here and in the device; the wheels stay disarmed.
+
+        The device may be stopped though the gate is not: by an earlier host, or by others.
+        """
+        latched = self.gate.state in (DeviceState.EMERGENCY_STOP, DeviceState.FAULT)
         answer = self.gate.reset(self._now_ns)
         self._gate_changed()
+        if self.gate.state is not DeviceState.DISARMED:
+            return answer
+        held = self.device.release()
+        if held and not latched:
+            return True, f'{", ".join(held)}: the emergency stop is reset'
         return answer
 
     def close(self) -> None:

@@ -58,7 +58,7 @@ class DeviceNode(Node):
             TestbedSettings(values['command_timeout'], values['sensor_timeout'],
                             values['timeout_action']))
         device = self._testbed.device
-        self._log, self._rejected = RareLog(self), Recently()
+        self._log, self._errors, self._rejected = RareLog(self), RareLog(self), Recently()
         self._topics = DeviceTopics(self, self._testbed, values['mechanism'])
         self.create_subscription(JointState, 'flywheel_command', guard(self._on_command), RELIABLE)
         GateServices(self, self._testbed, guard, self.now_ns, self._announce)
@@ -130,7 +130,7 @@ class DeviceNode(Node):
             samples, timing = self._testbed.tick(stamp_ns, self.now_ns())
         except FourbarError as error:
             self._pace.give_up()
-            self.get_logger().error(f'{error}: the device stands still')
+            self._errors.error(f'{error}: the device stands still')
             return
         step_ns = steady_ns() - begin_ns
         # Whoever answers the tick should know by then what state the device is in.

@@ -149,7 +149,7 @@ class Recently:
 
 
 class RareLog:
-    """Log warnings at most once per LOG_PERIOD; rclpy's own throttle costs 0.3 ms a call."""
+    """Log at most once per LOG_PERIOD; rclpy's own throttle costs 0.3 ms a call."""
 
     def __init__(self, node):
         self._logger = node.get_logger()
@@ -158,10 +158,17 @@ class RareLog:
 
     def warn(self, message):
         """Log, or count as held back."""
+        self._write(self._logger.warning, message)
+
+    def error(self, message):
+        """Likewise, of what is worse."""
+        self._write(self._logger.error, message)
+
+    def _write(self, write, message):
         now_ns = steady_ns()
         if self._last_ns is not None and now_ns - self._last_ns < LOG_PERIOD * 1e9:
             self._held += 1
             return
         more = f' ({self._held} more since the last message)' if self._held else ''
-        self._logger.warning(message + more)
+        write(message + more)
         self._last_ns, self._held = now_ns, 0

@@ -90,6 +90,7 @@ class EmulatorNode(Node):
         self._truth_period_ns = round(1e9 / values['truth_rate'])
         self._truth = GroundTruth(self, table, self._truth_period_ns)
         self._truth_ns = self._spin_ns = now_ns
+        self._met_edge = False
         self._runtime = runtime
         self.get_logger().info(
             f'{", ".join(f"link_{letter}" for letter in letters)} with mechanism '
@@ -107,9 +108,16 @@ class EmulatorNode(Node):
             self._truth_ns += max(
                 1, (now_ns - self._truth_ns) // self._truth_period_ns) * self._truth_period_ns
             self._truth.publish(emulator.samples.stamp_ns, emulator.samples.truth)
+            self._tell_of_edge()
         if now_ns - self._spin_ns >= SPIN_NS:
             self._spin_ns = now_ns
             self._runtime.executor.spin_once(timeout_sec=0.0)
+
+    def _tell_of_edge(self):
+        """Say once what people who stand beside a table would see."""
+        if not self._met_edge and 'edge' in self._emulator.table.diagnosis():
+            self._met_edge = True
+            self.get_logger().warning('the linkage has met the edge of the table')
 
     def _changed(self, values):
         """Make and end trouble and faults: what is refused leaves all as it was."""

@@ -74,6 +74,8 @@ class Bench(Device):
         self.gates: list[DeviceState] = []
         self.found: list[Finding] = []
         self.in_the_way: list[str] = []
+        self.held: list[str] = []
+        self.releases = 0
         self.closed = False
         self.gate = ArmingGate()
         self.gate_then = (self.gate.state, '')
@@ -88,6 +90,11 @@ class Bench(Device):
     def gate_changed(self, state: DeviceState) -> None:
         """Take down what the gate does."""
         self.gates.append(state)
+
+    def release(self) -> Sequence[str]:
+        """Take down that it was released, and tell what it was made to hold."""
+        self.releases += 1
+        return self.held
 
     def findings(self) -> Sequence[Finding]:
         """Find what it was made to."""

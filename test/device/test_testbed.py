@@ -280,6 +280,21 @@ def test_device_is_told_every_change_of_the_gate_once(operate: Operate) -> None:
                                DeviceState.DISARMED, DeviceState.ARMED]
 
 
+def test_reset_releases_what_the_device_holds_by_itself_but_never_while_armed(
+    operate: Operate,
+) -> None:
+    bed = operate()
+    assert bed.testbed.reset() == (True, 'nothing to reset: armed')
+    assert bed.bench.releases == 0
+    bed.testbed.emergency_stop('test')
+    assert bed.testbed.reset() == (True, 'emergency_stop is reset, disarmed')
+    assert bed.bench.releases == 1
+    assert bed.testbed.reset() == (True, 'nothing to reset: disarmed')
+    bed.bench.held = ['link_a', 'link_c']
+    assert bed.testbed.reset() == (True, 'link_a, link_c: the emergency stop is reset')
+    assert bed.bench.releases == 3
+
+
 def test_device_that_fails_to_take_a_command_latches_a_fault(operate: Operate) -> None:
     bed = operate()
     bed.bench.breaks = True

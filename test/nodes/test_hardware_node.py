@@ -455,3 +455,21 @@ def test_truth_agrees_with_link_angles_within_their_noise(bench):
         assert np.sqrt(np.mean(errors ** 2)) == pytest.approx(1.7453e-3, rel=0.35)
         assert np.abs(errors.mean()) < 5e-4
         assert np.abs(errors).max() < 6 * 1.7453e-3
+
+
+def test_emulator_says_once_that_the_linkage_met_the_edge_of_its_table(
+        suite, make_probe, tmp_path):
+    """Here a steep and narrow one."""
+    text = (share_directory() / 'config' / 'table_prototype.yaml').read_text()
+    lines = [f'  {name}: {values[name]}' if (name := line.split(':')[0].strip()) in (
+        values := {'tilt_x': 0.002, 'size_x': 0.47}) else line for line in text.splitlines()]
+    table = tmp_path / 'steep.yaml'
+    table.write_text('\n'.join(lines))
+    here, nobody = free_channels(2)
+    emulator = suite.node(
+        'prototype_emulator', {**on_bus(here, nobody), 'table': str(table)}, '/edge')
+    probe = make_probe('/edge')
+    probe.follow('sim/link_states')
+    probe.wait(lambda: 'met the edge of the table' in emulator.stderr)
+    probe.more('sim/link_states', 250)
+    assert emulator.stderr.count('the linkage has met the edge of the table') == 1

@@ -123,6 +123,18 @@ class LinkEstimate:
     poses: Floats
     residuals: tuple[tuple[Floats, Floats, Floats], ...]
 
+    @property
+    def excess(self) -> float:
+        """
+        How many times the residuals are what changes from sample to sample [1].
+
+        About 1 where nothing but noise is left; more where something moved the links that is not
+        in the model.
+        """
+        steps = np.concatenate([np.diff(left) for _, _, left in self.residuals])
+        left = np.concatenate([left for _, _, left in self.residuals])
+        return float(np.sqrt(2.0 * np.mean(left ** 2) / np.mean(steps ** 2)))
+
     def parameters(self) -> list[Quantity]:
         """Return the twelve, whose intervals rest on the prior where the data do not tell."""
         errors = self.sizes * np.sqrt(np.diag(self.covariance))

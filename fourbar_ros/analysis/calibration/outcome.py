@@ -49,6 +49,8 @@ import numpy as np
 PRECISION = 0.01
 # So well should a zero be known: a tenth of the noise of a good sensor [rad].
 ZERO_PRECISION = 5e-4
+# How many times their noise the residuals of the links may be.
+MOST_EXCESS = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +199,8 @@ def links_outcome(recording: Recording, mechanism: Mechanism) -> Outcome:
                 'text': one.text, 'weights': one.weights.tolist(), 'determined': one.determined,
                 'standard_error_in_priors': one.error, 'change_in_priors': one.change}
                 for one in found.combinations],
-            'losses': vars(found.losses), 'residual_rms_rad': found.noise}, {}, draw)
+            'losses': vars(found.losses), 'residual_rms_rad': found.noise,
+            'residual_over_noise': found.excess}, {}, draw)
 
 
 def _links_text(found: LinkEstimate, parameters: Sequence[Quantity],
@@ -214,6 +217,11 @@ def _links_text(found: LinkEstimate, parameters: Sequence[Quantity],
                   *(f'  {one.text}' for one in others)]
     lines += ['', 'for the mechanism file (intervals rest on 10 % where the data do not tell):',
               as_table(parameters), f'residuals {np.degrees(found.noise):.3g} deg rms']
+    if found.excess > MOST_EXCESS:
+        lines.append(
+            f'these are {found.excess:.2g} times the noise, at most {MOST_EXCESS:g} is usual: '
+            'something else moved the links (the edge of the table, a hand, a cable); do not '
+            'take these values')
     return '\n'.join(lines)
 
 

@@ -278,6 +278,7 @@ class Emulator:
         if trouble == 'silent' or self._troubles.get('bus'):
             return
         said = list(self._codec.to_host(report))
+        fresh = {frame.frame_id: frame for frame in said}
         if trouble == 'corrupted':
             said = [frame._replace(data=bytes([frame.data[0] ^ 0x10]) + frame.data[1:])
                     for frame in said]
@@ -285,7 +286,7 @@ class Emulator:
             said += [Frame(0x7FF, b'?')]
         elif trouble == 'replayed':
             said += [self._last_sent.get(frame.frame_id, frame) for frame in said]
-        self._last_sent.update({frame.frame_id: frame for frame in said})
+        self._last_sent.update(fresh)
         frames += said
 
     def _hears(self, link: int) -> bool:

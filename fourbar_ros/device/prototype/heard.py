@@ -36,6 +36,10 @@ AHEAD_NS = 2_000_000
 # A sample that is older when it arrives is none [ns].
 OLDEST_NS = 500_000_000
 
+# A heartbeat that is behind the last one is an old one, unless that is so long ago that nobody
+# knows how many were lost; later than when its loss is noticed [ns].
+BEAT_MEMORY_NS = 1_000_000_000
+
 # Electronics that were started before others within this time are two at once [ns].
 BOOT_MEMORY_NS = 3_000_000_000
 
@@ -188,14 +192,17 @@ class HeardLink:
 
     def take_heartbeat(self, report: Heartbeat, arrival_ns: int) -> None:
         """Take a sign of life."""
-        if report.sequence is not None and self._beat is not None:
-            if report.sequence == self._beat and report.boot == self._boot:
-                self.counts['replayed'] += 1
-                return
-            self.counts['lost_heartbeats'] += (report.sequence - self._beat - 1) % SEQUENCES
-        self._beat = report.sequence
         if report.boot is not None:
             self._started(report.boot, arrival_ns)
+        if report.sequence is not None and self._beat is not None:
+            ahead = (report.sequence - self._beat) % SEQUENCES
+            assert self.heartbeat_ns is not None
+            if not 0 < ahead <= SEQUENCES // 2 and (
+                    arrival_ns - self.heartbeat_ns < BEAT_MEMORY_NS):
+                self.counts['replayed'] += 1
+                return
+            self.counts['lost_heartbeats'] += (ahead - 1) % SEQUENCES
+        self._beat = report.sequence
         self.heartbeat, self.heartbeat_ns = report, arrival_ns
         self.state = report.state
 

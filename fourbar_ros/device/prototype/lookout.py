@@ -81,10 +81,9 @@ class Lookout:
         found = tuple(finding for finding in self._watch.findings()
                       if finding.reaction is not Reaction.WARN)
         self._watched &= bool(found)
-        if self._watched:
-            found = tuple(finding for finding in found if finding.reaction is Reaction.STOP)
-        elif self._state is not DeviceState.ARMED:
-            found = ()
+        if not self._driving(drive):
+            found = tuple(finding for finding in found
+                          if self._watched and finding.reaction is Reaction.STOP)
         self.findings = found
 
     def obstacles(self) -> list[str]:
@@ -104,6 +103,10 @@ class Lookout:
             told[where] = '; '.join(filter(None, (told.get(where), finding.text)))
         return told
 
+    def _driving(self, drive: Drive) -> bool:
+        """Tell whether a wheel may have power, be it to park it after commands stayed away."""
+        return self._state is DeviceState.ARMED or bool(drive.powered.any())
+
     def _obstacles_of(self, link: HeardLink) -> list[str]:
         if link.heartbeat_ns is None:
             return ['was never heard']
@@ -113,7 +116,9 @@ class Lookout:
         if not link.clock.settled:
             told.append('its clock is not known yet')
         if link.state not in (LinkState.IDLE, LinkState.COASTING, None):
-            told.append(f'its electronics say {link.state.name.lower()}')
+            way_out = (', call reset_emergency_stop first'
+                       if link.state is LinkState.STOPPED else '')
+            told.append(f'its electronics say {link.state.name.lower()}{way_out}')
         limit = self._table['wheel_speed_to_arm'].limit
         if abs(link.wheel_speed) > limit:
             told.append(f'its wheel turns at {abs(link.wheel_speed):.3g} rad/s, limit {limit:g}')
@@ -122,7 +127,7 @@ class Lookout:
     def _look_at(self, index: int, name: str, link: HeardLink, now_ns: int,
                  drive: Drive) -> None:
         table, look = self._table, self._watch.look
-        armed = self._state is DeviceState.ARMED
+        driving = self._driving(drive)
         assert link.heartbeat_ns is not None
         silence = (now_ns - (link.answer_ns or self._since_ns)) * 1e-9
         look('wheel_silent', name, silence > table['wheel_silent'].limit, silence,
@@ -130,12 +135,12 @@ class Lookout:
         silence = (now_ns - link.heartbeat_ns) * 1e-9
         look('heartbeat_lost', name, silence > table['heartbeat_lost'].limit, silence,
              'no heartbeat for {0:.3g} s, limit {1:g}', now_ns)
-        boots = link.boots - self._armed_boots[index] if armed else 0
+        boots = link.boots - self._armed_boots[index] if driving else 0
         look('reboot', name, boots > table['reboot'].limit, boots,
              'it has started anew while it was armed', now_ns)
         look('two_of_one_id', name, link.twins > table['two_of_one_id'].limit, link.twins + 1,
              '{0} links answer to its id', now_ns)
-        powered = armed and bool(drive.powered[index])
+        powered = bool(drive.powered[index])
         state = '' if link.state is None else link.state.name.lower()
         look('not_armed', name, powered and link.state not in (LinkState.ARMED, None), state,
              'it was told to drive, but says that it is {0}', now_ns)
@@ -144,7 +149,7 @@ class Lookout:
         speed = abs(link.wheel_speed)
         look('overspeed', name, speed > speed_limit, speed,
              f'its wheel turns at {{0:.4g}} rad/s, limit {speed_limit:.4g}', now_ns)
-        look('unasked_torque', name, not powered and armed
+        look('unasked_torque', name, not powered and driving
              and abs(link.torque) > table['unasked_torque'].limit * torque_limit, link.torque,
              'its motor gives {0:.3g} N m without power', now_ns)
         asked = float(drive.values[index])

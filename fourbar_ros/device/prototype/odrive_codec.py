@@ -206,6 +206,7 @@ class _Axis:
         self._told: bool | None = None
         self._enabled = False
         self._limited = torque_constant is None
+        self._limit: Frame | None = None
         self._voltage: float | None = None
         self._temperature: float | None = None
         self._heartbeat: Heartbeat | None = None
@@ -280,7 +281,9 @@ class _Axis:
             # Every time: one that is lost must not leave the power on.
             self._enabled, self._told = False, None
             return [self._state.frame({'Axis_Requested_State': _IDLE})]
-        frames = [drive]
+        # One that was started anew, unseen, knows only its own limits.
+        frames = [] if self._enabled or self._limit is None else [self._limit]
+        frames.append(drive)
         if self._told is not message.by_speed:
             frames.append(self._mode.frame({
                 'Control_Mode': _BY_SPEED if message.by_speed else _BY_TORQUE,
@@ -288,7 +291,7 @@ class _Axis:
         if not self._enabled:
             # Not every time: who disarmed by itself must stay so until it is disarmed and armed.
             frames.append(self._state.frame({'Axis_Requested_State': _CLOSED_LOOP}))
-        if len(frames) > 1:
+        if frames[-1] is not drive:
             # Before, so that it does not begin with what it was last told in that mode; and after,
             # in case it forgot.
             frames.append(drive)
@@ -305,8 +308,8 @@ class _Axis:
         counts = {'Velocity_Limit': self._speed_limit.write_at_most(message.speed / tau),
                   'Current_Limit': self._current_limit.write_at_most(
                       message.torque / self._constant)}
-        self._limited = True
-        return [self._limits.frame(counts)]
+        self._limited, self._limit = True, self._limits.frame(counts)
+        return [self._limit]
 
     # The host reads
 

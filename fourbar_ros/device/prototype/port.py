@@ -15,7 +15,7 @@
 """
 A bus, whatever carries it: any interface that python-can knows, and one kind of error.
 
-python-can is imported only here and in `udp_bus`, and not before a bus is opened.
+python-can is imported only here, in `udp_bus` and in `serial_bus`, and not before a bus is opened.
 """
 
 from __future__ import annotations
@@ -41,7 +41,10 @@ USUAL_INTERFACES = ('socketcan', 'fourbar_udp', 'slcan', 'pcan', 'kvaser', 'gs_u
                     'ixxat', 'virtual')
 
 # Constructors that name every option they know, and let others pass.
-_TOLERANT = ('socketcan', 'slcan', 'gs_usb', 'virtual')
+_TOLERANT = ('socketcan', 'slcan', 'gs_usb', 'serial', 'virtual')
+
+_BESIDE = {'foreign': 'datagrams_foreign', 'malformed': 'datagrams_malformed',
+           'unreachable': 'datagrams_unreachable', 'garbled': 'bytes_garbled'}
 
 # These stamp frames with system time, so that it is known how long a frame waited to be read.
 SYSTEM_TIME = ('socketcan', 'fourbar_udp')
@@ -162,12 +165,12 @@ class Port:
     def facts(self) -> dict[str, object]:
         """Tell what a person wants to know of the bus."""
         told: dict[str, object] = {
-            'bus': self.name, 'frames_sent': self.sent, 'frames_received': self.received,
-            'error_frames': self.errors, 'frames_dropped': self.dropped}
-        # What fourbar_udp counts beside.
-        for name in ('foreign', 'malformed', 'unreachable'):
+            'bus_name': self.name, 'frames_sent': self.sent, 'frames_received': self.received,
+            'frames_errors': self.errors, 'frames_dropped': self.dropped}
+        # What fourbar_udp and serial count beside.
+        for name, fact in _BESIDE.items():
             if hasattr(self._bus, name):
-                told[f'datagrams_{name}'] = getattr(self._bus, name)
+                told[fact] = getattr(self._bus, name)
         if trouble := self.trouble:
             told['bus_trouble'] = trouble
         return told
@@ -220,11 +223,18 @@ def open_port(interface: str, channel: str, bitrate: int = 0, options: str = '')
         raise BusError(f'{name}: no such interface (usual ones: {", ".join(USUAL_INTERFACES)})')
     try:
         if interface in _TOLERANT:
-            _check_options(name, interface, settings)
+            kind = _kind(interface)
+            _check_options(name, kind, settings)
+            if interface == 'serial':
+                return Port(kind(channel, **settings), interface, channel)
         # Nothing from the files that python-can keeps in the home of whoever runs this.
         bus = can.Bus(channel, interface, ignore_config=True, **settings)
     except BusError:
         raise
+    except (can.CanInterfaceNotImplementedError, ImportError, NameError) as error:
+        # Some drivers of python-can look for their library not before it is needed.
+        raise BusError(f'{name}: what it needs is not installed: {_cause(error)} (serial lines '
+                       'and multicast: pip install fourbar_ros[hardware])') from error
     except Exception as error:
         # Drivers raise what they like.
         raise BusError(f'{name}: {_cause(error)}') from error
@@ -245,10 +255,19 @@ def _settings(name: str, options: str) -> dict[str, Any]:
     return settings
 
 
-def _check_options(name: str, interface: str, settings: dict[str, Any]) -> None:
+def _kind(interface: str) -> type[Any]:
+    """Return the class of a bus."""
     from can.interfaces import BACKENDS
-    module, kind = BACKENDS[interface]
-    known = signature(getattr(import_module(module), kind)).parameters
+    module, name = BACKENDS[interface]
+    if interface == 'serial':
+        # The same bytes, but a line that is read as it shall be.
+        module = 'fourbar_ros.device.prototype.serial_bus'
+    kind: type[Any] = getattr(import_module(module), name)
+    return kind
+
+
+def _check_options(name: str, kind: type[Any], settings: dict[str, Any]) -> None:
+    known = signature(kind).parameters
     if unknown := sorted(set(settings) - set(known) - {'bitrate'}):
         options = sorted(set(known) - {'channel', 'bitrate', 'kwargs', 'can_filters'})
         raise BusError(f'{name}: no option {", ".join(unknown)} (known are {", ".join(options)})')

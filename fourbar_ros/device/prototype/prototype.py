@@ -48,6 +48,7 @@ from fourbar_ros.device.prototype.messages import (
     FrameError,
     Heartbeat,
     Limits,
+    LinkState,
     MotorReport,
     Release,
     Stop,
@@ -68,21 +69,17 @@ MOST_FRAMES = 2000
 # Counters of frames that are no good, whose sum per second is watched.
 BAD = ('length', 'checksum', 'value', 'replayed', 'late', 'wrong_time', 'foreign')
 
+# While a gone bus keeps an emergency stop company, it is opened again at most so often [ns].
+RETRY_NS = 1_000_000_000
+
+NO_RATE = 'its angles come without a rate, so none is taken: it has no gyro, set gyro to false'
+
 # How often the last command is repeated when the host leaves.
 LAST_WORDS = 3
 
 
 class Bus(Protocol):
-    """
-    What sends and receives frames; times are of the host's steady clock [ns].
-
-    :ivar sent, received, errors, dropped: number of frames.
-    """
-
-    sent: int
-    received: int
-    errors: int
-    dropped: int
+    """What sends and receives frames; times are of the host's steady clock [ns]."""
 
     @property
     def trouble(self) -> str | None:
@@ -102,6 +99,9 @@ class Bus(Protocol):
         :returns: the frame and when it arrived, None if none came in time.
         :raises BusError: the bus is gone.
         """
+
+    def facts(self) -> dict[str, object]:
+        """Tell what a person wants to know of it, the number of frames above all."""
 
     def close(self) -> None:
         """Leave the bus."""
@@ -136,6 +136,10 @@ class Prototype(Device):
         self._codec = codec
         self._open_bus = open_bus
         self._bus: Bus | None = open_bus()
+        # When it may be opened again, if that has failed.
+        self._rateless: set[str] = set()
+        self._retry_ns: int | None = None
+        self._refusal = ''
         self._steady_ns = steady_ns
         self._stamp_of = stamp_of
         self._answer_timeout_ns = round(answer_timeout_s * 1e9)
@@ -152,10 +156,12 @@ class Prototype(Device):
         """
         Ask the wheels, take along what else was said, and look whether all is well.
 
-        :raises BusError: the bus is gone; the next step tries to open it again.
+        :raises BusError: the bus is gone; it is tried to be opened again at the next step after
+            the gate has changed, and now and then.
         """
         if self._bus is None:
-            self._bus = self._open_bus()
+            self._bus = self._opened_again()
+        self._drive = drive
         try:
             round_trip_ns = self._ask(drive)
         except BusError:
@@ -182,22 +188,25 @@ class Prototype(Device):
             raise
 
     def gate_changed(self, state: DeviceState) -> None:
-        """Stop or release the links at once, and remember how they are when they are armed."""
-        was, self._state = self._state, state
+        """Stop the links at once, and remember how they are when they are armed."""
+        self._state = state
+        self._retry_ns = None
         self._lookout.gate_changed(state, self._steady_ns())
+        if state is DeviceState.EMERGENCY_STOP:
+            self._send_if_there(Stop())
+
+    def release(self) -> Sequence[str]:
+        """Release all links; tell which of them say that they are stopped."""
+        self._send_if_there(Release())
         if self._bus is None:
-            return
-        try:
-            if state is DeviceState.EMERGENCY_STOP:
-                self._send(Stop())
-            elif was is DeviceState.EMERGENCY_STOP:
-                self._send(Release())
-        except BusError:
-            self._lose_bus()
+            return []
+        return [name for name, link in zip(LINK_NAMES, self.links)
+                if link.state is LinkState.STOPPED]
 
     def obstacles(self) -> Sequence[str]:
         """Tell what speaks against arming: links, wheels, clocks, and what must not go on."""
-        return self._lookout.obstacles()
+        return [*(f'{name}: {NO_RATE}' for name in sorted(self._rateless)),
+                *self._lookout.obstacles()]
 
     def findings(self) -> Sequence[Finding]:
         """Tell what was found at the last step that must have consequences."""
@@ -213,6 +222,7 @@ class Prototype(Device):
         if missing := [name for name, link in zip(LINK_NAMES, self.links)
                        if link.heartbeat_ns is None]:
             told['missing'] = f'waiting for {", ".join(missing)}: never heard'
+        told.update(dict.fromkeys(sorted(self._rateless), NO_RATE))
         for where, text in self._lookout.troubles().items():
             told[where] = '; '.join(filter(None, (told.get(where), text)))
         return told
@@ -221,8 +231,7 @@ class Prototype(Device):
         """Tell counters of the bus, and of each link its health and its clock."""
         told: dict[str, object] = {}
         if self._bus is not None:
-            told = {f'frames_{kind}': getattr(self._bus, kind)
-                    for kind in ('sent', 'received', 'errors', 'dropped')}
+            told = self._bus.facts()
         told.update({f'frames_{kind}': count for kind, count in sorted(self._counts.items())})
         for name, link in zip(LINK_NAMES, self.links):
             beat = link.heartbeat
@@ -341,6 +350,31 @@ class Prototype(Device):
         for frame in self._codec.to_links(message):
             self._bus.send(frame)
 
+    def _send_if_there(self, message: Stop | Release) -> None:
+        """Send it where there is a bus; the next step tells that there is none any more."""
+        if self._bus is None:
+            return
+        try:
+            self._send(message)
+        except BusError:
+            self._lose_bus()
+
+    def _opened_again(self) -> Bus:
+        """
+        Open the bus, but do not live for that: it may take a while.
+
+        :raises BusError: it is not there, or was not a moment ago.
+        """
+        begin_ns = self._steady_ns()
+        if self._retry_ns is not None and begin_ns < self._retry_ns:
+            raise BusError(self._refusal)
+        try:
+            return self._open_bus()
+        except BusError as error:
+            self._refusal, end_ns = str(error), self._steady_ns()
+            self._retry_ns = end_ns + max(RETRY_NS, 10 * (end_ns - begin_ns))
+            raise
+
     def _lose_bus(self) -> None:
         bus, self._bus = self._bus, None
         if bus is not None:
@@ -359,7 +393,9 @@ class Prototype(Device):
                 rates = np.empty(0)
                 if self.measures_rates:
                     if rate is None:
+                        self._rateless.add(name)
                         continue
+                    self._rateless.discard(name)
                     rates = np.array([rate])
                 readings.append(SensorReading(
                     measured_ns + shift_ns, (name,),

@@ -21,6 +21,7 @@ from typing import Any
 from fourbar_ros.analysis.calibration.excitation import MultiSine
 from fourbar_ros.analysis.calibration.link_model import parameters_of
 from fourbar_ros.analysis.calibration.links import link_estimate, LinkEstimate
+from fourbar_ros.analysis.calibration.outcome import _links_text, MOST_EXCESS
 from fourbar_ros.analysis.calibration.quantity import CalibrationError, WIDTH_95
 from fourbar_ros.analysis.calibration.signals import LinkSignal, WheelSignal
 from fourbar_ros.mechanism import Mechanism, reduced_form
@@ -73,6 +74,23 @@ def test_reduced_inertias_are_found_to_one_percent(
         assert np.abs(values - wanted).max() < 0.01 * size, f'seed {seed}'
         before = np.array([item.before for item in found.reduced_inertias()], dtype=float)
         assert np.abs(values - wanted).max() < 0.3 * np.abs(before - wanted).max(), f'seed {seed}'
+
+
+def test_only_noise_is_left_where_nothing_else_moved_the_links(
+        estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]]) -> None:
+    assert max(found.excess for of_one in estimates.values() for _, found in of_one) < 1.2
+
+
+def test_what_stays_in_the_residuals_is_told(
+        estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]]) -> None:
+    """A degree to and fro, as a push by the edge of the table leaves it."""
+    _, found = estimates['prototype'][0]
+    assert 'something else moved the links' not in _links_text(found, [], [])
+    pushed = replace(found, residuals=tuple(
+        (times, angles, left + np.radians(1.0) * np.sin(times))
+        for times, angles, left in found.residuals))
+    assert pushed.excess > MOST_EXCESS
+    assert 'something else moved the links' in _links_text(pushed, [], [])
 
 
 @pytest.mark.parametrize('name', START)

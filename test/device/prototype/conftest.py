@@ -60,9 +60,6 @@ class Wire:
     trouble: str | None = None
     said: deque[Frame] = field(default_factory=lambda: deque(maxlen=1000))
     sent: int = 0
-    received: int = 0
-    errors: int = 0
-    dropped: int = 0
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(1))
     _number: count[int] = field(default_factory=count)
     _to_links: list[tuple[int, int, Frame]] = field(default_factory=list)
@@ -113,6 +110,10 @@ class Wire:
         """Let somebody say something to the host."""
         self._push(self._to_host, frame, self.now_ns)
 
+    def facts(self) -> dict[str, object]:
+        """Tell how much was said."""
+        return {'frames_sent': self.sent}
+
     def close(self) -> None:
         """Leave it as it is."""
 
@@ -130,7 +131,8 @@ class World:
     """
 
     def __init__(self, codec: Codec | None = None, links: tuple[int, ...] = (0, 1, 2, 3),
-                 table: str = 'prototype') -> None:
+                 table: str = 'prototype',
+                 settings: TestbedSettings | None = None) -> None:
         self.codec = codec or DbcCodec('prototype')
         self.wire = Wire()
         self.samples: list[Samples] = []
@@ -139,7 +141,7 @@ class World:
         self.prototype = Prototype(
             mechanism, self.open_bus, self.codec, load_safety('prototype'), PERIOD_NS, 2e-3,
             False, lambda: self.wire.now_ns, self.stamp_of)
-        self.testbed = Testbed(self.prototype, TestbedSettings())
+        self.testbed = Testbed(self.prototype, settings or TestbedSettings())
         self.command: Callable[[], None] | None = None
         self._ticks = 0
 

@@ -275,6 +275,20 @@ def test_limits_are_missing_until_they_were_sent():
     assert host.from_links(heartbeat(1, 0, 1)).faults == {'no_limits'}
 
 
+def test_limits_are_sent_again_before_power():
+    """An ODrive may have started anew without anybody having heard it say so."""
+    host, link = make(), make()
+    limits = host.to_links(Limits(1, 0.05, 300.0))
+    enabled, disabled = (Command(1, 0.01, False, enable, 0) for enable in (True, False))
+    assert host.to_links(enabled)[:1] == limits
+    assert limits[0] not in host.to_links(enabled)
+    host.to_links(disabled)
+    heard = told(host, link, enabled)
+    assert isinstance(heard[0], Limits)
+    assert [message.enable for message in heard[1:]] == [False, False, True, True]
+    assert len(host.to_links(replace(disabled, enable=True, link=2))) == 4
+
+
 def test_limits_without_torque_constants_are_those_of_the_odrive():
     host = OdriveCodec()
     assert list(host.to_links(Limits(1, 0.05, 300.0))) == []

@@ -14,11 +14,17 @@
 
 """One port for every bus: frames through, arrival times of one clock, and one kind of error."""
 
+from contextlib import suppress
 import errno
 import logging
+import os
+from pty import openpty
+from select import select
 import subprocess
 import sys
+from threading import Thread
 from time import clock_gettime_ns, CLOCK_MONOTONIC_RAW, time
+from tty import setraw
 
 import can
 from fourbar_ros.device.prototype.messages import BusError, Frame
@@ -74,7 +80,41 @@ def udp(request):
     return [Port(bus, 'fourbar_udp', '127.0.0.1:0') for bus in (first, second)]
 
 
-@pytest.fixture(params=[virtual, udp], ids=lambda kind: kind.__name__)
+def serial(request):
+    """Open two ports at the ends of one line."""
+    near, far = Line(), Line()
+    request.addfinalizer(near.close)
+    request.addfinalizer(far.close)
+    Thread(target=connect, args=(near, far), daemon=True).start()
+    return [open_port('serial', line.name) for line in (near, far)]
+
+
+class Line:
+    """A serial line with a port at one end, and with this program at the other."""
+
+    def __init__(self):
+        self.far, self._near = openpty()
+        for end in (self.far, self._near):
+            setraw(end)
+        self.name = os.ttyname(self._near)
+
+    def close(self):
+        """Pull it out."""
+        for end in (self.far, self._near):
+            with suppress(OSError):
+                os.close(end)
+
+
+def connect(*lines):
+    """Hand on what is said on one of two lines to the other, until one is closed."""
+    ends = [line.far for line in lines]
+    with suppress(OSError, ValueError):
+        while True:
+            for end in select(ends, (), ())[0]:
+                os.write(ends[1 - ends.index(end)], os.read(end, 4096))
+
+
+@pytest.fixture(params=[virtual, udp, serial], ids=lambda kind: kind.__name__)
 def pair(request):
     """Open two ports that hear one another."""
     ports = request.param(request)
@@ -225,6 +265,8 @@ def test_with_closes(request):
     ('fourbar_udp', '127.0.0.1:0', 'peers=127.0.0.1', 'HOST:PORT'),
     ('fourbar_udp', '127.0.0.1:0', 'peers=127.0.0.1:9 speed=1', 'knows no speed'),
     ('fourbar_udp', 'can0', 'peers=127.0.0.1:9', 'HOST:PORT'),
+    ('serial', '/dev/ttyNONE', '', 'No such file or directory'),
+    ('serial', '/dev/ttyNONE', 'baud=9600', 'no option baud .known are baudrate, rtscts.'),
 ])
 def test_bus_that_cannot_be_opened_is_told_in_one_line(
         interface, channel, options, told, caplog, capfd):
@@ -246,6 +288,59 @@ def test_open_bus_of_datagrams():
     with open_port('fourbar_udp', '127.0.0.1:0', 1_000_000, 'peers=127.0.0.1:9') as port:
         assert port.receive(0.0) is None
         assert port.facts()['datagrams_foreign'] == 0
+
+
+@pytest.fixture
+def line():
+    """Return a serial line."""
+    line = Line()
+    yield line
+    line.close()
+
+
+def test_line_that_says_half_a_frame_holds_nobody_up_and_is_heard_out(line):
+    said = b'\xaa' + bytes(4) + b'\x02' + b'\x23\x01\x00\x00' + b'ab\xbb'
+    with open_port('serial', line.name) as port:
+        for begin, end in ((0, 1), (1, 7), (7, 12)):
+            os.write(line.far, said[begin:end])
+            assert port.receive(0.0) is None
+        os.write(line.far, said[12:] + said)
+        assert [port.receive(PATIENCE_S)[0] for _ in range(2)] == [Frame(0x123, b'ab')] * 2
+        assert port.facts()['bytes_garbled'] == 0
+
+
+@pytest.mark.parametrize('noise', [
+    b'\x12\x34', b'\xaa', b'\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa', b'\xbb',
+    b'\xaa' + bytes(4) + b'\x09' + bytes(8),              # a length that is none
+    b'\xaa' + bytes(4) + b'\x01\x00\x08\x00\x00\x00\xbb',   # an identifier that is none
+    b'\xaa' + bytes(4) + b'\x01\x00\x01\x00\x00\x00\xbc'])  # an end that is none
+def test_noise_on_a_line_costs_no_frame_after_it(line, noise):
+    said = b'\xaa' + bytes(4) + b'\x02' + b'\x23\x01\x00\x00' + b'ab\xbb'
+    with open_port('serial', line.name) as port:
+        os.write(line.far, said + noise + 20 * said)
+        assert [port.receive(PATIENCE_S)[0] for _ in range(21)] == [Frame(0x123, b'ab')] * 21
+        assert port.receive(0.0) is None
+        assert port.facts()['bytes_garbled'] == 1
+
+
+def test_line_that_is_pulled_out_is_told(line):
+    with open_port('serial', line.name) as port:
+        line.close()
+        with pytest.raises(BusError, match=f'^serial {line.name}: cannot receive: '):
+            port.receive(PATIENCE_S)
+
+
+def test_line_belongs_to_one(line):
+    with open_port('serial', line.name), pytest.raises(BusError, match=f'serial {line.name}: '):
+        open_port('serial', line.name)
+
+
+@pytest.mark.parametrize('interface, options', [('serial', ''), ('slcan', '')])
+def test_without_pyserial_it_is_told_what_to_install(monkeypatch, interface, options):
+    monkeypatch.setitem(sys.modules, 'serial', None)
+    monkeypatch.setattr('can.interfaces.slcan.serial', None)
+    with pytest.raises(BusError, match=r'not installed: .*pip install fourbar_ros\[hardware\]'):
+        open_port(interface, '/dev/ttyNONE', 0, options)
 
 
 def test_without_python_can_it_is_told_what_to_install(monkeypatch):

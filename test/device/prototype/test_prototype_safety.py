@@ -16,7 +16,7 @@
 
 from pathlib import Path
 
-from fourbar_ros.device import DeviceState
+from fourbar_ros.device import DeviceState, TestbedSettings
 from fourbar_ros.device.prototype.messages import (
     BusError,
     Command,
@@ -90,6 +90,27 @@ def test_link_in_trouble_ends_it(driven, trouble, state, within, word) -> None:
     driven.wire.emulators[0].trouble('link_c', '')
     driven.run(1.5)
     assert driven.arm() == (True, 'armed')
+
+
+@pytest.mark.parametrize(('trouble', 'state'), [
+    ('silent', DeviceState.DISARMED), ('hot', DeviceState.DISARMED),
+    ('reboot', DeviceState.EMERGENCY_STOP)])
+def test_wheels_that_are_parked_under_power_are_watched_too(make_world, trouble, state) -> None:
+    # Before the links coast by themselves.
+    world = make_world(settings=TestbedSettings(
+        command_timeout_s=0.05, timeout_action='hold_speed'))
+    world.run(1.0)
+    world.torque(*TORQUE)
+    assert world.arm() == (True, 'armed')
+    world.run(0.2)
+    world.command = None
+    world.run(0.2)
+    assert world.testbed.gate.state is DeviceState.DISARMED
+    assert all(firmware(world, link).drive()[2] for link in range(4))
+    world.wire.emulators[0].trouble('link_b', trouble)
+    world.run(0.4)
+    assert world.testbed.gate.state is state
+    assert_coasting(world)
 
 
 def test_heartbeat_lost_while_armed_is_an_emergency_stop(driven) -> None:
@@ -194,6 +215,38 @@ def test_bus_that_is_gone_is_a_fault_and_comes_back(driven) -> None:
     assert driven.arm() == (True, 'armed')
 
 
+def test_links_without_gyros_are_told_where_there_should_be_some(world) -> None:
+    world.prototype.measures_rates = True
+    world.run(0.3)
+    assert not any(samples.links for samples in world.samples[-50:])
+    armed, reason = world.arm()
+    assert not armed
+    assert 'link_d: its angles come without a rate' in reason
+    assert 'set gyro to false' in world.prototype.diagnosis()['link_a']
+
+
+def test_bus_that_is_gone_during_a_stop_is_not_opened_at_every_tick(driven) -> None:
+    """To open one may take seconds, in which nobody would be heard."""
+    driven.testbed.emergency_stop('test')
+    driven.wire.broken = True
+    tried_ns: list[int] = []
+
+    def open_bus():
+        tried_ns.append(driven.wire.now_ns)
+        return driven.open_bus()
+    driven.prototype._open_bus = open_bus
+    for _ in range(625):
+        with pytest.raises(BusError):
+            driven.tick()
+    assert len(tried_ns) == 3
+    assert min(np.diff(tried_ns)) >= 1_000_000_000
+    driven.wire.broken = False
+    driven.testbed.reset()
+    driven.tick()
+    driven.run(0.3)
+    assert driven.testbed.gate.state is DeviceState.DISARMED
+
+
 def test_emergency_stop_latches_in_the_links_too(driven) -> None:
     driven.testbed.emergency_stop('test')
     driven.run(0.01)
@@ -267,8 +320,36 @@ def test_frames_that_are_no_good_are_ignored_and_counted(driven, trouble) -> Non
     facts = driven.prototype.facts()
     counted = facts.get('frames_foreign') if trouble == 'foreign' else facts['link_a.replayed']
     assert counted > 500
+    assert facts.get('link_a.lost_heartbeats', 0) == 0
     assert 'frames a second are no good, limit 20' in driven.prototype.diagnosis()['bus']
     assert driven.samples[-1].wheels.efforts == pytest.approx(TORQUE, rel=1e-3)
+
+
+def test_heartbeats_of_the_past_keep_no_link_alive(driven) -> None:
+    beats = [driven.codec.to_host(Heartbeat(
+        1, sequence, LinkState.ARMED, frozenset(), 12.0, 30.0,
+        driven.prototype.links[1].heartbeat.boot))[0]
+        for sequence in ((driven.prototype.links[1].heartbeat.sequence - back) % 16
+                         for back in (1, 2))]
+    driven.wire.emulators[0].trouble('link_b', 'silent')
+
+    def stopped() -> bool:
+        for frame in beats:
+            driven.wire.inject(frame)
+        return driven.testbed.gate.state is DeviceState.EMERGENCY_STOP
+    wait(driven, stopped, 0.6)
+    assert 'link_b: no heartbeat for' in driven.testbed.gate.reason
+
+
+def test_heartbeats_count_on_after_a_long_silence(driven) -> None:
+    """Whatever their number is by then."""
+    for seconds in (1.2, 1.25, 1.3, 1.4, 1.6):
+        driven.wire.emulators[0].trouble('link_b', 'silent')
+        driven.run(seconds)
+        driven.wire.emulators[0].trouble('link_b', '')
+        driven.testbed.reset()
+        driven.run(0.3)
+        assert driven.arm() == (True, 'armed')
 
 
 def test_old_command_does_not_move_a_wheel(driven) -> None:
@@ -329,6 +410,38 @@ def test_stop_frame_of_anybody_stops_the_links(driven) -> None:
     wait(driven, lambda: not driven.testbed.gate.armed, 0.2)
     assert 'says that it is stopped' in driven.testbed.gate.reason
     assert_coasting(driven)
+
+
+def test_links_that_somebody_else_stopped_are_released_by_a_reset(world) -> None:
+    """As by a host before this one, or where the release was lost."""
+    world.wire.send(world.codec.to_links(Stop())[0])
+    world.run(0.1)
+    assert world.testbed.gate.state is DeviceState.DISARMED
+    armed, reason = world.arm()
+    assert not armed
+    assert 'link_c: its electronics say stopped, call reset_emergency_stop first' in reason
+    assert world.testbed.reset() == (
+        True, 'link_a, link_b, link_c, link_d: the emergency stop is reset')
+    world.run(0.1)
+    assert [firmware(world, link).state for link in range(4)] == [LinkState.IDLE] * 4
+    assert world.arm() == (True, 'armed')
+
+
+def test_links_stay_no_longer_stopped_than_until_a_reset_reaches_them(driven) -> None:
+    driven.testbed.emergency_stop('test')
+    driven.run(0.1)
+    driven.wire.broken = True
+    driven.testbed.reset()
+    with pytest.raises(BusError):
+        driven.tick()
+    assert driven.testbed.gate.state is DeviceState.FAULT
+    driven.wire.broken = False
+    driven.testbed.reset()
+    driven.run(0.3)
+    assert firmware(driven, 0).state is LinkState.STOPPED
+    driven.testbed.reset()
+    driven.run(0.3)
+    assert driven.arm() == (True, 'armed')
 
 
 def test_flood_of_foreign_frames_does_not_hold_the_host_up(driven) -> None:
