@@ -253,11 +253,41 @@ def test_values_that_the_scenario_refuses_are_told_before_any_run(vary: dict[str
     assert '\n' not in str(caught.value)
 
 
-def test_bounds_that_are_never_met_are_told() -> None:
-    made = campaign({'initial.link_a': {'normal': {'mean': 0.0, 'std': 1.0},
-                                        'within': [20.0, 21.0]}})
-    with pytest.raises(CampaignError, match='1000 draws were not within 20 to 21'):
+@pytest.mark.parametrize(('law', 'bounds'), [
+    ({'normal': {'mean': 0.0, 'std': 1.0}}, [20.0, 21.0]),
+    ({'normal': {'mean': 0.0, 'std': 1.0}}, [-9.0, -3.1]),
+    ({'normal': {'mean': 0.0, 'std': 0.0}}, [0.1, 1.0]),
+    ({'lognormal': {'median': 1.0, 'sigma': 0.1}}, [-1.0, 0.0]),
+    ({'lognormal': {'median': 1.0, 'sigma': 0.1}}, [1.5, 9.0]),
+])
+def test_bounds_that_are_hardly_ever_met_are_told(law: dict[str, Any], bounds: list[float]
+                                                  ) -> None:
+    with pytest.raises(CampaignError, match=r'within: less than 0.1 % of the draws are between'):
+        campaign({'initial.link_a': {**law, 'within': bounds}})
+
+
+@pytest.mark.parametrize(('law', 'bounds'), [
+    ({'normal': {'mean': 0.0, 'std': 1.0}}, [3.05, 9.0]),
+    ({'normal': {'mean': 0.0, 'std': 0.0}}, [0.0, 1.0]),
+    ({'lognormal': {'median': 1.0, 'sigma': 0.1}}, [-1.0, 0.75]),
+])
+def test_rare_bounds_are_met_in_every_run(law: dict[str, Any], bounds: list[float]) -> None:
+    """A thousand draws do not always reach what one of a thousand does."""
+    made = campaign({'initial.link_a': {**law, 'within': bounds}}, runs=50)
+    found = draws(made, 'initial.link_a', 50)
+    assert ((bounds[0] <= found) & (found <= bounds[1])).all()
+
+
+@pytest.mark.parametrize('given', [
+    {'lognormal': {'median': 1.0, 'sigma': 1000.0}},
+    {'loguniform': [1.7976931348623157e308, 1.7976931348623157e308]},
+    {'uniform': [-1.7e308, 1.7e308], 'scale': True},
+])
+def test_draws_beyond_all_numbers_are_refused(given: dict[str, Any]) -> None:
+    made = campaign({'initial.link_a': given}, runs=20)
+    with pytest.raises(CampaignError, match=r'initial.link_a must be between') as caught:
         made.check()
+    assert '\n' not in str(caught.value)
 
 
 def test_identity_is_what_the_numbers_depend_on(campaign_file: Callable[..., str]) -> None:
