@@ -19,6 +19,7 @@ import contextlib
 import json
 import os
 from pathlib import Path
+import signal
 import socket
 import subprocess
 import sys
@@ -187,6 +188,30 @@ def test_scheduler_that_dies_leaves_what_is_finished(
     assert 'the same command goes on' in line
     assert main(['study', 'montecarlo', path, '-o', str(folder), '--runs', str(kept + 1),
                  '--jobs', '1']) == 0
+
+
+@pytest.mark.parametrize('stage', ['begin', 'work'])
+def test_cluster_that_answers_no_more_is_told(
+    cluster: Cluster, campaign_file: Callable[..., str], monkeypatch: pytest.MonkeyPatch,
+    stage: str,
+) -> None:
+    """Halted, or unplugged: connections stay, and nothing comes."""
+    monkeypatch.setattr(campaign_cluster, 'ANSWER', 1.0)
+    made = load_campaign(campaign_file())
+    worker = cluster.worker()
+    if stage == 'begin':
+        # The scheduler knows of it, and does not see either that it is halted.
+        with distributed.Client(cluster.address, set_as_default=False) as client:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        worker.send_signal(signal.SIGSTOP)
+    with contextlib.closing(on_cluster(made, [[0], *[[1]] * 50], cluster.address)) as found:
+        if stage == 'work':
+            monkeypatch.setattr(campaign_cluster, 'ANSWER', PATIENCE)
+            next(found)
+            monkeypatch.setattr(campaign_cluster, 'ANSWER', 1.0)
+            cluster.scheduler.send_signal(signal.SIGSTOP)
+        with pytest.raises(CampaignError, match='answer.* 1 s'):
+            list(found)
 
 
 def test_worker_of_another_version_is_named(
