@@ -150,6 +150,22 @@ def test_scheduler_that_is_not_there_is_told_soon(
     assert time.monotonic() - begin < 15.0
 
 
+@pytest.mark.parametrize('address', ['', '127.0.0.1', 'tcp://127.0.0.1', 'tcp://127.0.0.1:port'])
+def test_what_is_no_address_is_told_without_a_client(
+    study: Callable[..., int], capsys: pytest.CaptureFixture[str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, address: str,
+) -> None:
+    """A client would wait and print a traceback when it is deleted. No folder is left."""
+    def fail(*_: Any, **__: Any) -> None:
+        raise AssertionError('a client was made')
+    monkeypatch.setattr(distributed, 'Client', fail)
+    assert study('out', '--scheduler', address) == 2
+    error, = capsys.readouterr().err.splitlines()
+    assert error.startswith(f'fourbar study: no scheduler at {address} (')
+    assert error.endswith('or leave --scheduler away')
+    assert not (tmp_path / 'out').exists()
+
+
 def test_scheduler_without_workers_is_told(
         cluster: Cluster, study: Callable[..., int], capsys: pytest.CaptureFixture[str],
         monkeypatch: pytest.MonkeyPatch) -> None:

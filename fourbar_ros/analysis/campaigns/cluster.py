@@ -62,12 +62,15 @@ def on_cluster(campaign: Campaign, batches: Sequence[Sequence[int]], address: st
     """
     try:
         import distributed
+        from distributed.comm.addressing import get_address_host_port
         from distributed.comm.core import CommClosedError
     except ImportError as error:
         raise CampaignError(f'--scheduler needs {error.name}: pip install '
                             'fourbar_ros[analysis]') from None
     with _quiet():
         try:
+            # A client that is given no such address leaves a traceback behind when it is deleted.
+            get_address_host_port(address, strict=True)
             client = distributed.Client(address, timeout=CONNECTING, set_as_default=False)
         except (OSError, *_TIMED_OUT, ValueError, ImportError) as error:
             reason = (f'within {CONNECTING:g} s' if isinstance(error, (OSError, *_TIMED_OUT))
