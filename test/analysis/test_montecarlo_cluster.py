@@ -37,6 +37,7 @@ import pyarrow.parquet
 import pytest
 
 distributed = pytest.importorskip('distributed')
+dask = pytest.importorskip('dask')
 
 PATIENCE = 90.0
 LOCAL = ['--host', '127.0.0.1', '--no-dashboard']
@@ -150,18 +151,32 @@ def test_scheduler_that_is_not_there_is_told_soon(
     assert time.monotonic() - begin < 15.0
 
 
-@pytest.mark.parametrize('address', ['', '127.0.0.1', 'tcp://127.0.0.1', 'tcp://127.0.0.1:port'])
+TLS = 'tls://127.0.0.1:8786'
+NOWHERE = {f'distributed.comm.tls.{name}': '/nowhere/a.pem'
+           for name in ('ca-file', 'client.cert', 'client.key')}
+
+
+@pytest.mark.parametrize(('address', 'configured', 'told'), [
+    ('', {}, 'missing port number'),
+    ('127.0.0.1', {}, 'missing port number'),
+    ('tcp://127.0.0.1', {}, 'missing port number'),
+    ('tcp://127.0.0.1:port', {}, 'port'),
+    (TLS, {}, "tls needs certificate, key and CA in Dask's configuration"),
+    (TLS, NOWHERE, 'cannot be read: [Errno 2] No such file'),
+    ('tcp://127.0.0.1:1', {'distributed.comm.require-encryption': True}, 'requires encryption'),
+])
 def test_what_is_no_address_is_told_without_a_client(
     study: Callable[..., int], capsys: pytest.CaptureFixture[str], tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, address: str,
+    monkeypatch: pytest.MonkeyPatch, address: str, configured: dict[str, Any], told: str,
 ) -> None:
     """A client would wait and print a traceback when it is deleted. No folder is left."""
     def fail(*_: Any, **__: Any) -> None:
         raise AssertionError('a client was made')
     monkeypatch.setattr(distributed, 'Client', fail)
-    assert study('out', '--scheduler', address) == 2
+    with dask.config.set(configured):
+        assert study('out', '--scheduler', address) == 2
     error, = capsys.readouterr().err.splitlines()
-    assert error.startswith(f'fourbar study: no scheduler at {address} (')
+    assert error.startswith(f'fourbar study: no scheduler at {address} (') and told in error
     assert error.endswith('or leave --scheduler away')
     assert not (tmp_path / 'out').exists()
 

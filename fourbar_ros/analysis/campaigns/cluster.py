@@ -62,15 +62,13 @@ def on_cluster(campaign: Campaign, batches: Sequence[Sequence[int]], address: st
     """
     try:
         import distributed
-        from distributed.comm.addressing import get_address_host_port
         from distributed.comm.core import CommClosedError
     except ImportError as error:
         raise CampaignError(f'--scheduler needs {error.name}: pip install '
                             'fourbar_ros[analysis]') from None
     with _quiet():
         try:
-            # A client that is given no such address leaves a traceback behind when it is deleted.
-            get_address_host_port(address, strict=True)
+            _check_address(address)
             client = distributed.Client(address, timeout=CONNECTING, set_as_default=False)
         except (OSError, *_TIMED_OUT, ValueError, ImportError) as error:
             reason = (f'within {CONNECTING:g} s' if isinstance(error, (OSError, *_TIMED_OUT))
@@ -83,6 +81,28 @@ def on_cluster(campaign: Campaign, batches: Sequence[Sequence[int]], address: st
         finally:
             with contextlib.suppress(OSError, *_TIMED_OUT, CommClosedError):
                 client.close(timeout=2.0)
+
+
+def _check_address(address: str) -> None:
+    """
+    See that a client can be made: one that cannot prints a traceback when it is deleted.
+
+    :raises ValueError: it cannot; says why.
+    """
+    from distributed import Security
+    from distributed.comm.addressing import get_address_host_port
+
+    get_address_host_port(address)
+    security = Security()
+    try:
+        context = security.get_connection_args('client').get('ssl_context')
+    except (OSError, ValueError) as error:
+        raise ValueError("the certificates of Dask's configuration cannot be read: "
+                         f'{_line(error)}') from None
+    if address.startswith('tls://') and context is None:
+        raise ValueError("tls needs certificate, key and CA in Dask's configuration")
+    if security.require_encryption and not address.startswith('tls://'):
+        raise ValueError("Dask's configuration requires encryption, tls://")
 
 
 def _check_workers(client: Any, address: str, campaign: Campaign) -> None:
