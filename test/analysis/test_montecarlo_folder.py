@@ -29,6 +29,7 @@ import time
 from typing import Any
 
 from fourbar_ros.analysis.campaigns import folder as campaign_folder
+from fourbar_ros.analysis.campaigns import processes as campaign_processes
 from fourbar_ros.analysis.campaigns import versions as campaign_versions
 from fourbar_ros.analysis.campaigns.draws import Parameter
 from fourbar_ros.analysis.campaigns.file import Campaign, load_campaign
@@ -344,6 +345,19 @@ def importable(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv('PYTHONPATH', folder)
     yield
     sys.modules.pop('test_montecarlo_folder', None)
+
+
+def test_interrupt_while_processes_are_started_is_not_lost() -> None:
+    """And is for this process alone."""
+    asked = 'import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))'
+    answers = []
+    with pytest.raises(KeyboardInterrupt):
+        with campaign_processes._interrupts_ignored():
+            os.kill(os.getpid(), signal.SIGINT)
+            answers.append(subprocess.check_output([sys.executable, '-c', asked]))
+    assert answers == [b'True\n']
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.usefixtures('importable')
