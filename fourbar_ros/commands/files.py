@@ -71,6 +71,21 @@ def write_files(contents: Mapping[Path, str | bytes]) -> None:
                 file.write(content)
 
 
+def check_file(path: Path) -> None:
+    """
+    Refuse a file that :func:`write_whole` could not write, before the work that it is for.
+
+    :raises OutputError: with what stands in the way.
+    """
+    parent = path.absolute().parent
+    if not parent.is_dir():
+        raise OutputError(f'cannot write {path}: no such folder')
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise OutputError(f'cannot write {path}: it is not a regular file')
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise OutputError(f'cannot write {path}: {parent} is not writable')
+
+
 def check_new_folder(folder: Path) -> None:
     """
     Refuse a folder that exists or cannot be made.
@@ -91,7 +106,7 @@ def kept_folder(folder: Path) -> Iterator[None]:
     """
     Make a folder if it is missing, and its parents; if nothing comes of it, not even those stay.
 
-    :raises OutputError: it cannot be made.
+    :raises OutputError: it cannot be made, or nothing can be written into it.
     """
     path = folder.absolute()
     missing = [above for above in (path, *path.parents) if not above.exists()]
@@ -99,6 +114,8 @@ def kept_folder(folder: Path) -> Iterator[None]:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f'cannot make {folder}: {error.strerror}') from None
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise OutputError(f'cannot write into {folder}: it is not writable')
     try:
         yield
     except BaseException:

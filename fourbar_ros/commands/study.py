@@ -51,26 +51,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study, print and write what it found."""
     from fourbar_ros.analysis.checks import checks_as_json, print_checks
-    from fourbar_ros.commands.files import kept_folder, OutputError, write_files
+    from fourbar_ros.commands.files import check_file, kept_folder, write_files
     from fourbar_ros.commands.progress import show_progress
     from fourbar_ros.mechanism.compiled import announced
 
     folder = args.output or Path(f'study_{args.name}')
     study = load_study(args.name, folder, **{
         name: value for name in OPTIONS if (value := getattr(args, name)) is not None})
-    if args.json and not args.json.absolute().parent.is_dir():
-        raise OutputError(f'cannot write {args.json}: no such folder')
     # Made before the work, not after it.
-    with kept_folder(folder), announced():
-        result = study(show_progress)
-    document = {'study': args.name, 'checks': checks_as_json(result.checks),
-                'skipped': list(result.skipped), **result.data}
-    text = json.dumps(document, indent=2, allow_nan=False) + '\n'
-    files: Mapping[Path, str | bytes] = {
-        **{folder / name: content for name, content in result.files.items()},
-        folder / (result.document or f'{args.name}.json'): text,
-        **({args.json: text} if args.json else {})}
-    write_files(files)
+    with kept_folder(folder):
+        if args.json:
+            check_file(args.json)
+        with announced():
+            result = study(show_progress)
+        document = {'study': args.name, 'checks': checks_as_json(result.checks),
+                    'skipped': list(result.skipped), **result.data}
+        text = json.dumps(document, indent=2, allow_nan=False) + '\n'
+        files: Mapping[Path, str | bytes] = {
+            **{folder / name: content for name, content in result.files.items()},
+            folder / (result.document or f'{args.name}.json'): text,
+            **({args.json: text} if args.json else {})}
+        write_files(files)
 
     print(result.text)
     print_checks(result.checks)

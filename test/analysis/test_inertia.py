@@ -15,7 +15,9 @@
 """The search for wheel inertias: what it is compared with, and that it can be taken up again."""
 
 from dataclasses import replace
+import errno
 from math import degrees, pi, radians
+import os
 from pathlib import Path
 
 from fourbar_ros.analysis.studies import inertia, inertia_search, Sample, StudyError
@@ -177,6 +179,35 @@ def test_what_cannot_be_kept_is_told(quick: list[int], tmp_path: Path) -> None:
     (tmp_path / 'searches').write_text('a file in the way')
     with pytest.raises(StudyError, match=r'cannot keep .*seed_0.json: .*; what is finished is'):
         study(tmp_path)
+
+
+def test_full_disk_leaves_nothing_unfinished(
+        quick: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = Path.write_text
+
+    def full(path: Path, text: str) -> None:
+        write(path, text[:20])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(Path, 'write_text', full)
+    with pytest.raises(StudyError, match='cannot keep .*seed_0.json: No space left on device'):
+        study(tmp_path)
+    assert not list((tmp_path / 'searches').iterdir())
+
+
+def test_two_that_search_for_the_same_do_not_disturb_each_other(
+        quick: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other one keeps its own just before this one does."""
+    write, here = Path.write_text, os.getpid()
+
+    def disturbed(path: Path, text: str) -> None:
+        write(path, text)
+        monkeypatch.setattr(Path, 'write_text', write)
+        with monkeypatch.context() as other:
+            other.setattr(os, 'getpid', lambda: here + 1)
+            study(tmp_path)
+    monkeypatch.setattr(Path, 'write_text', disturbed)
+    study(tmp_path)
+    assert len(list((tmp_path / 'searches').iterdir())) == 5
 
 
 def test_paper_inertias_are_worse_by_what_their_pairs_differ(quick: list[int]) -> None:

@@ -19,6 +19,7 @@ import contextlib
 import json
 import os
 from pathlib import Path
+import signal
 import socket
 import subprocess
 import sys
@@ -36,6 +37,7 @@ import pyarrow.parquet
 import pytest
 
 distributed = pytest.importorskip('distributed')
+dask = pytest.importorskip('dask')
 
 PATIENCE = 90.0
 LOCAL = ['--host', '127.0.0.1', '--no-dashboard']
@@ -149,6 +151,36 @@ def test_scheduler_that_is_not_there_is_told_soon(
     assert time.monotonic() - begin < 15.0
 
 
+TLS = 'tls://127.0.0.1:8786'
+NOWHERE = {f'distributed.comm.tls.{name}': '/nowhere/a.pem'
+           for name in ('ca-file', 'client.cert', 'client.key')}
+
+
+@pytest.mark.parametrize(('address', 'configured', 'told'), [
+    ('', {}, 'missing port number'),
+    ('127.0.0.1', {}, 'missing port number'),
+    ('tcp://127.0.0.1', {}, 'missing port number'),
+    ('tcp://127.0.0.1:port', {}, 'port'),
+    (TLS, {}, "tls needs certificate, key and CA in Dask's configuration"),
+    (TLS, NOWHERE, 'cannot be read: [Errno 2] No such file'),
+    ('tcp://127.0.0.1:1', {'distributed.comm.require-encryption': True}, 'requires encryption'),
+])
+def test_what_is_no_address_is_told_without_a_client(
+    study: Callable[..., int], capsys: pytest.CaptureFixture[str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, address: str, configured: dict[str, Any], told: str,
+) -> None:
+    """A client would wait and print a traceback when it is deleted. No folder is left."""
+    def fail(*_: Any, **__: Any) -> None:
+        raise AssertionError('a client was made')
+    monkeypatch.setattr(distributed, 'Client', fail)
+    with dask.config.set(configured):
+        assert study('out', '--scheduler', address) == 2
+    error, = capsys.readouterr().err.splitlines()
+    assert error.startswith(f'fourbar study: no scheduler at {address} (') and told in error
+    assert error.endswith('or leave --scheduler away')
+    assert not (tmp_path / 'out').exists()
+
+
 def test_scheduler_without_workers_is_told(
         cluster: Cluster, study: Callable[..., int], capsys: pytest.CaptureFixture[str],
         monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,6 +219,30 @@ def test_scheduler_that_dies_leaves_what_is_finished(
     assert 'the same command goes on' in line
     assert main(['study', 'montecarlo', path, '-o', str(folder), '--runs', str(kept + 1),
                  '--jobs', '1']) == 0
+
+
+@pytest.mark.parametrize('stage', ['begin', 'work'])
+def test_cluster_that_answers_no_more_is_told(
+    cluster: Cluster, campaign_file: Callable[..., str], monkeypatch: pytest.MonkeyPatch,
+    stage: str,
+) -> None:
+    """Halted, or unplugged: connections stay, and nothing comes."""
+    monkeypatch.setattr(campaign_cluster, 'ANSWER', 1.0)
+    made = load_campaign(campaign_file())
+    worker = cluster.worker()
+    if stage == 'begin':
+        # The scheduler knows of it, and does not see either that it is halted.
+        with distributed.Client(cluster.address, set_as_default=False) as client:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        worker.send_signal(signal.SIGSTOP)
+    with contextlib.closing(on_cluster(made, [[0], *[[1]] * 50], cluster.address)) as found:
+        if stage == 'work':
+            monkeypatch.setattr(campaign_cluster, 'ANSWER', PATIENCE)
+            next(found)
+            monkeypatch.setattr(campaign_cluster, 'ANSWER', 1.0)
+            cluster.scheduler.send_signal(signal.SIGSTOP)
+        with pytest.raises(CampaignError, match='answer.* 1 s'):
+            list(found)
 
 
 def test_worker_of_another_version_is_named(

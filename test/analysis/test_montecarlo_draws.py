@@ -30,6 +30,7 @@ from fourbar_ros.loop.description import load_description
 import numpy as np
 import pytest
 from scipy.stats import kstest, lognorm, loguniform, norm, truncnorm, uniform
+import yaml
 
 RUNS = 2000
 # With this share of good samples a test fails; the seeds are fixed, so it does or it does not.
@@ -134,6 +135,36 @@ def test_believed_may_be_what_is_drawn() -> None:
     assert found.believed.link_inertias == pytest.approx(2.0 * found.mechanism.link_inertias)
     apart = campaign(vary).scenario(1)
     assert apart.believed.link_masses.tolist() != apart.mechanism.link_masses.tolist()
+
+
+def test_what_is_set_of_the_mechanism_is_believed_too() -> None:
+    """As by a scenario with that mechanism; what is set of `believed` comes after it."""
+    vary = {'mechanism.link_inertias': {'uniform': [0.9, 1.1], 'scale': True}}
+    masses = {'mechanism.link_masses': [0.5, 0.6, 0.7, 0.8]}
+    made = campaign(vary, set={'believed.link_masses.a': 0.4, **masses})
+    found = made.scenario(0)
+    assert found.mechanism.link_masses.tolist() == [0.5, 0.6, 0.7, 0.8]
+    assert found.believed.link_masses.tolist() == [0.4, 0.6, 0.7, 0.8]
+
+
+def test_scenario_that_says_what_is_believed_keeps_it(tmp_path: Path) -> None:
+    described = load_description('prototype')
+    described['believed']['link_masses'] = [0.4, 0.4, 0.4, 0.4]
+    (tmp_path / 'mine.yaml').write_text(yaml.safe_dump(described))
+    made = campaign_from({'scenario': 'mine.yaml', 'set': {'mechanism.link_masses.a': 0.7},
+                          'vary': {'initial.link_a': {'uniform': [0.0, 0.1]}}}, tmp_path)
+    found = made.scenario(0)
+    assert found.mechanism.link_masses.tolist() == [0.7, 0.6, 0.6, 0.6]
+    assert found.believed.link_masses.tolist() == [0.4, 0.4, 0.4, 0.4]
+
+
+def test_mechanism_may_be_set_by_its_name() -> None:
+    """Then its values have names like those of any other."""
+    made = campaign({'mechanism.link_masses.a': {'choice': [2.0], 'scale': True}},
+                    set={'mechanism': 'paper', 'table': 'ideal'})
+    found, nominal = made.scenario(0), load_scenario('paper').mechanism
+    assert found.mechanism.link_masses[0] == 2.0 * nominal.link_masses[0]
+    assert found.believed.link_masses.tolist() == nominal.link_masses.tolist()
 
 
 def test_grids_are_gone_through_once_each() -> None:
@@ -253,11 +284,41 @@ def test_values_that_the_scenario_refuses_are_told_before_any_run(vary: dict[str
     assert '\n' not in str(caught.value)
 
 
-def test_bounds_that_are_never_met_are_told() -> None:
-    made = campaign({'initial.link_a': {'normal': {'mean': 0.0, 'std': 1.0},
-                                        'within': [20.0, 21.0]}})
-    with pytest.raises(CampaignError, match='1000 draws were not within 20 to 21'):
+@pytest.mark.parametrize(('law', 'bounds'), [
+    ({'normal': {'mean': 0.0, 'std': 1.0}}, [20.0, 21.0]),
+    ({'normal': {'mean': 0.0, 'std': 1.0}}, [-9.0, -3.1]),
+    ({'normal': {'mean': 0.0, 'std': 0.0}}, [0.1, 1.0]),
+    ({'lognormal': {'median': 1.0, 'sigma': 0.1}}, [-1.0, 0.0]),
+    ({'lognormal': {'median': 1.0, 'sigma': 0.1}}, [1.5, 9.0]),
+])
+def test_bounds_that_are_hardly_ever_met_are_told(law: dict[str, Any], bounds: list[float]
+                                                  ) -> None:
+    with pytest.raises(CampaignError, match=r'within: less than 0.1 % of the draws are between'):
+        campaign({'initial.link_a': {**law, 'within': bounds}})
+
+
+@pytest.mark.parametrize(('law', 'bounds'), [
+    ({'normal': {'mean': 0.0, 'std': 1.0}}, [3.05, 9.0]),
+    ({'normal': {'mean': 0.0, 'std': 0.0}}, [0.0, 1.0]),
+    ({'lognormal': {'median': 1.0, 'sigma': 0.1}}, [-1.0, 0.75]),
+])
+def test_rare_bounds_are_met_in_every_run(law: dict[str, Any], bounds: list[float]) -> None:
+    """A thousand draws do not always reach what one of a thousand does."""
+    made = campaign({'initial.link_a': {**law, 'within': bounds}}, runs=50)
+    found = draws(made, 'initial.link_a', 50)
+    assert ((bounds[0] <= found) & (found <= bounds[1])).all()
+
+
+@pytest.mark.parametrize('given', [
+    {'lognormal': {'median': 1.0, 'sigma': 1000.0}},
+    {'loguniform': [1.7976931348623157e308, 1.7976931348623157e308]},
+    {'uniform': [-1.7e308, 1.7e308], 'scale': True},
+])
+def test_draws_beyond_all_numbers_are_refused(given: dict[str, Any]) -> None:
+    made = campaign({'initial.link_a': given}, runs=20)
+    with pytest.raises(CampaignError, match=r'initial.link_a must be between') as caught:
         made.check()
+    assert '\n' not in str(caught.value)
 
 
 def test_identity_is_what_the_numbers_depend_on(campaign_file: Callable[..., str]) -> None:

@@ -17,6 +17,7 @@
 from collections.abc import Callable, Iterator
 import errno
 import fcntl
+import inspect
 from io import StringIO
 import json
 import os
@@ -28,13 +29,19 @@ import time
 from typing import Any
 
 from fourbar_ros.analysis.campaigns import folder as campaign_folder
+from fourbar_ros.analysis.campaigns import processes as campaign_processes
+from fourbar_ros.analysis.campaigns import versions as campaign_versions
+from fourbar_ros.analysis.campaigns.draws import Parameter
 from fourbar_ros.analysis.campaigns.file import Campaign, load_campaign
 from fourbar_ros.analysis.campaigns.folder import CampaignFolder
+from fourbar_ros.analysis.campaigns.names import place_of
 from fourbar_ros.analysis.campaigns.processes import as_ready, CampaignError
 from fourbar_ros.analysis.campaigns.run import do_run
+from fourbar_ros.analysis.consistency import normalised_squares
 from fourbar_ros.analysis.progress import begin_at
 from fourbar_ros.analysis.studies import montecarlo, Result, StudyError
 from fourbar_ros.commands.main import main
+from fourbar_ros.loop import ClosedLoop
 import pyarrow.parquet
 import pytest
 from tqdm import tqdm
@@ -183,6 +190,28 @@ def test_other_campaign_is_not_resumed_into_the_folder(
     assert {file: file.read_bytes() for file in before} == before
 
 
+def test_folder_in_which_nothing_was_finished_belongs_to_no_campaign(
+        campaign_file: Callable[..., str], tmp_path: Path) -> None:
+    """Left empty by one that came to nothing, or as a killed one leaves it."""
+    first, other = load_campaign(campaign_file()), load_campaign(campaign_file('other', seed=6))
+    place = tmp_path / 'out'
+    with CampaignFolder(place, first):
+        assert (place / 'campaign.json').exists()
+    assert not list(place.iterdir())
+    CampaignFolder(place, first).__enter__()._let_go()
+    with CampaignFolder(place, other) as folder:
+        folder.add([do_run(other, 0)])
+    with pytest.raises(CampaignError, match='another campaign'):
+        CampaignFolder(place, first).__enter__()
+
+
+def test_versions_are_of_all_that_makes_the_numbers() -> None:
+    """What draws them is not the least of it."""
+    hashed = {path.resolve() for path in campaign_versions.sources()}
+    for made_by in (Campaign, Parameter, place_of, do_run, normalised_squares, ClosedLoop):
+        assert Path(str(inspect.getsourcefile(made_by))).resolve() in hashed
+
+
 def test_other_versions_are_not_mixed(
         campaign_file: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -316,6 +345,19 @@ def importable(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv('PYTHONPATH', folder)
     yield
     sys.modules.pop('test_montecarlo_folder', None)
+
+
+def test_interrupt_while_processes_are_started_is_not_lost() -> None:
+    """And is for this process alone."""
+    asked = 'import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))'
+    answers = []
+    with pytest.raises(KeyboardInterrupt):
+        with campaign_processes._interrupts_ignored():
+            os.kill(os.getpid(), signal.SIGINT)
+            answers.append(subprocess.check_output([sys.executable, '-c', asked]))
+    assert answers == [b'True\n']
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.usefixtures('importable')

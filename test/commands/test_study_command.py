@@ -17,8 +17,10 @@
 from collections.abc import Callable, Iterable
 import csv
 from dataclasses import replace
+import errno
 import json
 import math
+import os
 from pathlib import Path
 import subprocess
 import sys
@@ -147,6 +149,49 @@ def test_files_go_where_they_are_asked_to(
     assert err == 'fourbar study: no second line: no ink\n'
 
 
+def test_json_may_go_into_the_new_folder(stub: Stub, tmp_path: Path) -> None:
+    stub(lambda progress: result(0.5))
+    folder = tmp_path / 'new'
+    assert main(['study', 'validation', '-o', str(folder), '--json', str(folder / 'a.json')]) == 0
+    assert (folder / 'a.json').read_bytes() == (folder / 'validation.json').read_bytes()
+
+
+def test_places_that_are_not_writable_are_told_before_the_work(
+    stub: Stub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Whoever runs the tests may be allowed everything, so that is asked elsewhere."""
+    def fail(progress: Progress) -> Result:
+        raise AssertionError('it began to work')
+
+    stub(fail)
+    locked = tmp_path / 'locked'
+    locked.mkdir()
+    monkeypatch.setattr(os, 'access', lambda path, mode: Path(path) != locked)
+    assert main(['study', 'validation', '-o', str(locked)]) == 2
+    assert main(['study', 'validation', '-o', str(tmp_path / 'out'), '--json',
+                 str(locked / 'v.json')]) == 2
+    assert capsys.readouterr().err.splitlines() == [
+        f'fourbar study: cannot write into {locked}: it is not writable',
+        f'fourbar study: cannot write {locked / "v.json"}: {locked} is not writable']
+    assert list(tmp_path.iterdir()) == [locked]
+
+
+def test_study_that_cannot_be_written_leaves_no_folder(
+    stub: Stub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """As on a full disk."""
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    stub(lambda progress: result(0.5))
+    monkeypatch.setattr(os, 'replace', full)
+    assert main(['study', 'validation', '-o', str(tmp_path / 'out')]) == 2
+    assert 'No space left on device' in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_progress_does_not_change_what_it_shows(stub: Stub, tmp_path: Path) -> None:
     seen: list[Any] = []
 
@@ -168,7 +213,9 @@ def test_progress_does_not_change_what_it_shows(stub: Stub, tmp_path: Path) -> N
     (['validation', '--runs', '5', '--seed', '1'],
      'study validation takes no --runs, --seed'),
     (['validation', '-o', 'file/folder'], 'cannot make file/folder'),
-    (['validation', '--json', 'nowhere/v.json'], 'cannot write nowhere/v.json'),
+    (['validation', '--json', 'nowhere/v.json'], 'cannot write nowhere/v.json: no such folder'),
+    (['validation', '--json', '.'], 'cannot write .: it is not a regular file'),
+    (['validation', '--json', '/dev/null'], 'cannot write /dev/null: it is not a regular file'),
 ])
 def test_bad_input_is_one_line_and_exit_code_2(
     arguments: list[str], complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,

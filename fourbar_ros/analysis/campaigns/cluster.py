@@ -21,6 +21,7 @@ network that is trusted (docs/campaigns.md).
 
 from __future__ import annotations
 
+import asyncio
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 import contextlib
@@ -36,10 +37,14 @@ from fourbar_ros.analysis.campaigns.versions import difference, versions
 
 # How long to wait for a scheduler, for its first worker, and for one after all have gone [s].
 CONNECTING, FIRST_WORKER, NO_WORKER = 5.0, 15.0, 60.0
+# How long a scheduler or a worker that was there before may take to answer [s].
+ANSWER = 30.0
 # How often to look whether the cluster is still there [s].
 LOOK = 1.0
 # Batches that are given away beforehand, for each thread of the workers.
 AHEAD = 3
+# Dask's is that of asyncio, which is one of its own in Python 3.10.
+_TIMED_OUT = (TimeoutError, asyncio.TimeoutError)
 
 
 def on_cluster(campaign: Campaign, batches: Sequence[Sequence[int]], address: str
@@ -52,8 +57,8 @@ def on_cluster(campaign: Campaign, batches: Sequence[Sequence[int]], address: st
     :returns: rows of one batch after the other, as they are ready. A run that takes every worker
         with it on which it is tried has a row that says so; it is tried at last with nothing else
         on the cluster, since Dask blames all that a dead worker had.
-    :raises CampaignError: there is no such scheduler, or not any more; workers have other
-        versions; distributed is not installed.
+    :raises CampaignError: there is no such scheduler, or not any more; it answers no more, as one
+        that is halted or unplugged; workers have other versions; distributed is not installed.
     """
     try:
         import distributed
@@ -63,9 +68,10 @@ def on_cluster(campaign: Campaign, batches: Sequence[Sequence[int]], address: st
                             'fourbar_ros[analysis]') from None
     with _quiet():
         try:
+            _check_address(address)
             client = distributed.Client(address, timeout=CONNECTING, set_as_default=False)
-        except (OSError, TimeoutError, ValueError, ImportError) as error:
-            reason = (f'within {CONNECTING:g} s' if isinstance(error, (OSError, TimeoutError))
+        except (OSError, *_TIMED_OUT, ValueError, ImportError) as error:
+            reason = (f'within {CONNECTING:g} s' if isinstance(error, (OSError, *_TIMED_OUT))
                       else f'({_line(error)})')
             raise CampaignError(f'no scheduler at {address} {reason}: start one with '
                                 '`dask scheduler`, or leave --scheduler away') from None
@@ -73,18 +79,44 @@ def on_cluster(campaign: Campaign, batches: Sequence[Sequence[int]], address: st
             _check_workers(client, address, campaign)
             yield from _spread(client, address, campaign, batches)
         finally:
-            with contextlib.suppress(OSError, TimeoutError, CommClosedError):
+            with contextlib.suppress(OSError, *_TIMED_OUT, CommClosedError):
                 client.close(timeout=2.0)
+
+
+def _check_address(address: str) -> None:
+    """
+    See that a client can be made: one that cannot prints a traceback when it is deleted.
+
+    :raises ValueError: it cannot; says why.
+    """
+    from distributed import Security
+    from distributed.comm.addressing import get_address_host_port
+
+    get_address_host_port(address)
+    security = Security()
+    try:
+        context = security.get_connection_args('client').get('ssl_context')
+    except (OSError, ValueError) as error:
+        raise ValueError("the certificates of Dask's configuration cannot be read: "
+                         f'{_line(error)}') from None
+    if address.startswith('tls://') and context is None:
+        raise ValueError("tls needs certificate, key and CA in Dask's configuration")
+    if security.require_encryption and not address.startswith('tls://'):
+        raise ValueError("Dask's configuration requires encryption, tls://")
 
 
 def _check_workers(client: Any, address: str, campaign: Campaign) -> None:
     """See that there are workers, and that they make the same numbers as this process."""
     try:
         client.wait_for_workers(1, timeout=FIRST_WORKER)
-    except TimeoutError:
+    except _TIMED_OUT:
         raise CampaignError(f'the scheduler {address} has no workers: start some with '
                             f'`dask worker {address} --nthreads 1`') from None
-    found = client.run(_asked(), on_error='return')
+    try:
+        found = client.run(_asked(), on_error='return', callback_timeout=ANSWER)
+    except _TIMED_OUT:
+        raise CampaignError(f'the scheduler {address} or one of its workers does not answer '
+                            f'within {ANSWER:g} s') from None
     for worker, there in found.items():
         if isinstance(there, BaseException):
             raise CampaignError(f'worker {worker} cannot say its versions: {_line(there)}')
@@ -122,7 +154,8 @@ def _spread(client: Any, address: str, campaign: Campaign, batches: Sequence[Seq
     seen = time.monotonic()
     try:
         while waiting or running or suspects:
-            threads = sum(client.nthreads().values())
+            threads = sum(client.sync(
+                client.scheduler.ncores, workers=None, callback_timeout=ANSWER).values())
             if threads:
                 seen = time.monotonic()
             elif time.monotonic() - seen > NO_WORKER:
@@ -139,7 +172,7 @@ def _spread(client: Any, address: str, campaign: Campaign, batches: Sequence[Seq
             for future in _next(ready):
                 batch = running.pop(future)
                 try:
-                    yield future.result()
+                    yield future.result(timeout=ANSWER)
                 except distributed.KilledWorker:
                     if not alone:
                         suspects.extend(batch)
@@ -148,8 +181,9 @@ def _spread(client: Any, address: str, campaign: Campaign, batches: Sequence[Seq
                                                             'lack of memory perhaps')]
             if client.status != 'running':
                 raise gone
-    except (OSError, TimeoutError, distributed.CancelledError,
-            CommClosedError):
+    except _TIMED_OUT:
+        raise CampaignError(f'the scheduler {address} has not answered for {ANSWER:g} s') from None
+    except (OSError, distributed.CancelledError, CommClosedError):
         raise gone from None
     finally:
         with contextlib.suppress(Exception):  # noqa: BLE001 - the scheduler may be anything now

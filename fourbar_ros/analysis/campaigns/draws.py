@@ -26,7 +26,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import hashlib
 import json
-from math import exp, isfinite, log
+from math import erfc, exp, inf, isfinite, log, sqrt
 from typing import Any
 
 from fourbar_ros.analysis.campaigns.names import nearest, Place
@@ -45,8 +45,10 @@ KINDS = {
 
 OPTIONS = ('scale', 'add', 'each', 'within')
 
-# A bound that is met more rarely than this is a mistake.
-DRAWS = 1000
+# Bounds that a smaller share of the draws keeps are a mistake.
+LEAST_SHARE = 1e-3
+# None of so many draws keeps them in less than one of 1e43 cases then.
+DRAWS = 100_000
 
 
 @dataclass(frozen=True)
@@ -119,21 +121,27 @@ class Parameter:
     def _one(self, rng: np.random.Generator) -> Any:
         if self.kind == 'choice':
             return self.values[int(rng.integers(len(self.values)))]
-        low, high = self.within or (-np.inf, np.inf)
-        first, second = self.values
+        low, high = self.within or (-inf, inf)
         for _ in range(DRAWS):
-            if self.kind == 'uniform':
-                value = float(rng.uniform(first, second))
-            elif self.kind == 'normal':
-                value = first + second * float(rng.standard_normal())
-            elif self.kind == 'lognormal':
-                value = first * exp(second * float(rng.standard_normal()))
-            else:
-                value = exp(float(rng.uniform(log(first), log(second))))
+            try:
+                value = self._number(rng)
+            except OverflowError:
+                # Larger than any number: so it is told, and refused, like one that is not finite.
+                value = inf
             if low <= value <= high:
                 return value
         raise CampaignError(f'vary.{self.name}: {DRAWS} draws were not within '
                             f'{low:g} to {high:g}')
+
+    def _number(self, rng: np.random.Generator) -> float:
+        first, second = self.values
+        if self.kind == 'uniform':
+            return float(rng.uniform(first, second))
+        if self.kind == 'normal':
+            return float(first + second * float(rng.standard_normal()))
+        if self.kind == 'lognormal':
+            return float(first * exp(second * float(rng.standard_normal())))
+        return exp(float(rng.uniform(log(first), log(second))))
 
 
 def combined(nominal: Any, drawn: Any, how: str) -> Any:
@@ -185,8 +193,25 @@ def distribution(name: str, given: Any) -> tuple[str, tuple[Any, ...], dict[str,
     if (within := options.get('within')) is not None:
         if kind not in ('normal', 'lognormal'):
             raise CampaignError(f'{where}.within goes with normal and lognormal only')
-        options['within'] = _pair(f'{where}.within', within)
+        options['within'] = low, high = _pair(f'{where}.within', within)
+        if not _share(kind, values, low, high) >= LEAST_SHARE:
+            raise CampaignError(f'{where}.within: less than {100.0 * LEAST_SHARE:g} % of the '
+                                f'draws are between {low:g} and {high:g}')
     return kind, values, options
+
+
+def _share(kind: str, values: tuple[float, ...], low: float, high: float) -> float:
+    """Return which share of a normal or lognormal distribution is between two numbers."""
+    first, second = values
+    if kind == 'lognormal':
+        first, low, high = (log(each) if each > 0.0 else -inf for each in (first, low, high))
+    if second == 0.0:
+        return float(low <= first <= high)
+    below, above = ((each - first) / second / sqrt(2.0) for each in (low, high))
+    # From the tail on this side, where the difference of two that are nearly 1 is nothing.
+    if below > 0.0:
+        below, above = -above, -below
+    return 0.5 * (erfc(-above) - erfc(-below))
 
 
 def _values(where: str, kind: str, given: Any) -> tuple[Any, ...]:

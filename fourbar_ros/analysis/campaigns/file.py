@@ -39,7 +39,7 @@ from fourbar_ros.analysis.campaigns.run import METRICS
 from fourbar_ros.analysis.campaigns.versions import versions
 from fourbar_ros.configuration import config_file, load_yaml
 from fourbar_ros.errors import FourbarError
-from fourbar_ros.loop.description import load_description
+from fourbar_ros.loop.description import describe, load_description
 from fourbar_ros.loop.run import make_loop
 from fourbar_ros.loop.scenario import Scenario, scenario_from
 import numpy as np
@@ -248,9 +248,18 @@ def _nominal(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     changes = dict(_section('set', values))
     if 'duration' in values:
         changes['duration'] = values['duration']
-    for each, value in changes.items():
-        put(description, place_of(str(each), description, 'set', True), value)
-    return description
+    if description['believed'] == description['mechanism']:
+        # What is set of the mechanism is believed as well, then.
+        del description['believed']
+    apart = [str(each) for each in changes if str(each).split('.')[0] == 'believed']
+    for name, value in changes.items():
+        if name not in apart:
+            put(description, place_of(str(name), description, 'set', True), value)
+    # Names of files, and sections with keys left out, are spelled out.
+    description = describe(description, folder)
+    for name in apart:
+        put(description, place_of(name, description, 'set', True), changes[name])
+    return describe(description, folder)
 
 
 def _parameters(vary: Mapping[str, Any], description: Mapping[str, Any]

@@ -66,7 +66,7 @@ class CampaignFolder:
     def __enter__(self) -> CampaignFolder:
         """Take the folder, and see what is in it."""
         try:
-            (self.path / PARTS).mkdir(parents=True, exist_ok=True)
+            self.path.mkdir(parents=True, exist_ok=True)
             # Of the folder itself: so no file of it is left, and the kernel lets go of it when
             # the process dies.
             self._lock = os.open(self.path, os.O_RDONLY)
@@ -75,6 +75,7 @@ class CampaignFolder:
             except BlockingIOError:
                 raise CampaignError(f'{self.path} is in use by another campaign that runs: '
                                     'choose another --output or wait for it') from None
+            (self.path / PARTS).mkdir(exist_ok=True)
             for left in (*self.path.glob(f'.*{_UNFINISHED}'),
                          *(self.path / PARTS).glob(f'.*{_UNFINISHED}')):
                 left.unlink()
@@ -90,7 +91,11 @@ class CampaignFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Let go of it."""
+        """Let go of it, and leave nothing if it holds no row."""
+        if self._empty():
+            with contextlib.suppress(OSError):
+                (self.path / PARTS).rmdir()
+                (self.path / IDENTITY).unlink()
         self._let_go()
 
     def rows(self) -> pa.Table:
@@ -126,17 +131,21 @@ class CampaignFolder:
         _write(self.path / RUNS, _bytes(table))
         return table
 
+    def _empty(self) -> bool:
+        return not self._parts and not (self.path / RUNS).exists()
+
     def _claim(self) -> None:
         """Say whose it is, or see that it is ours."""
         path = self.path / IDENTITY
         ours = self.campaign.identity
-        if not path.exists():
-            if self._parts:
-                raise CampaignError(f'{self.path} holds runs but no {IDENTITY}: choose another '
-                                    '--output')
+        if self._empty():
+            # Of a campaign that came to nothing, perhaps.
             text = json.dumps({'hash': self.campaign.hash, **ours}, indent=2)
             _write(path, text.encode() + b'\n')
             return
+        if not path.exists():
+            raise CampaignError(f'{self.path} holds runs but no {IDENTITY}: choose another '
+                                '--output')
         try:
             theirs = json.loads(path.read_text())
             if not isinstance(theirs, dict):

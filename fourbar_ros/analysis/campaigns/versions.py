@@ -24,9 +24,10 @@ import platform
 
 import fourbar_ros
 
-# What a closed loop without ROS is made of, and what measures it.
+# What a closed loop without ROS is made of, what draws it, and what measures it.
 ROOMS = ('control', 'device', 'estimation', 'loop', 'mechanism', 'plant')
-MODULES = ('analysis/campaigns/run.py', 'analysis/consistency.py')
+MODULES = ('analysis/campaigns/draws.py', 'analysis/campaigns/file.py',
+           'analysis/campaigns/names.py', 'analysis/campaigns/run.py', 'analysis/consistency.py')
 LIBRARIES = ('numpy', 'scipy', 'numba', 'filterpy')
 
 
@@ -35,13 +36,19 @@ def versions() -> dict[str, str]:
     """Return versions by name; `sources` tells apart what has the same number."""
     package = Path(fourbar_ros.__file__).parent
     digest = hashlib.sha256()
-    for source in sorted([*(path for room in ROOMS for path in (package / room).rglob('*.py')),
-                          *(package / name for name in MODULES)]):
+    for source in sources():
         digest.update(source.relative_to(package).as_posix().encode() + b'\0')
         digest.update(source.read_bytes() + b'\0')
     return {'fourbar_ros': fourbar_ros.__version__, 'sources': digest.hexdigest()[:12],
             'python': '.'.join(platform.python_version_tuple()[:2]),
             **{name: metadata.version(name) for name in LIBRARIES}}
+
+
+def sources() -> list[Path]:
+    """Return the files of which the numbers are made, sorted."""
+    package = Path(fourbar_ros.__file__).parent
+    return sorted([*(path for room in ROOMS for path in (package / room).rglob('*.py')),
+                   *(package / name for name in MODULES)])
 
 
 def difference(here: dict[str, str], there: dict[str, str]) -> str:

@@ -29,6 +29,7 @@ from functools import cached_property, partial
 import io
 import json
 from math import degrees, inf, sqrt
+import os
 from pathlib import Path
 from typing import Any
 
@@ -199,10 +200,14 @@ def _kept(search: Search, folder: Path | None) -> tuple[list[float], int]:
     variables, evaluations = find(search)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_suffix('.part')
-        unfinished.write_text(json.dumps({
-            'search': described, 'variables': variables.tolist(), 'evaluations': evaluations}))
-        unfinished.replace(path)
+        # Of this process: two may search for the same.
+        unfinished = path.with_name(f'.{path.name}.{os.getpid()}')
+        try:
+            unfinished.write_text(json.dumps({
+                'search': described, 'variables': variables.tolist(), 'evaluations': evaluations}))
+            unfinished.replace(path)
+        finally:
+            unfinished.unlink(missing_ok=True)
     except OSError as error:
         raise StudyError(f'cannot keep {path}: {error.strerror}; what is finished is kept, run it '
                          'again to go on') from None

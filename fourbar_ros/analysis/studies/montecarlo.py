@@ -101,6 +101,8 @@ def run(progress: Progress, folder: Path | None, campaign: str, runs: int | None
             rows_with_time = kept.rows()
             table = kept.finish()
         except CampaignError as error:
+            if not finished:
+                raise
             raise CampaignError(f'{error}; {finished} of {sample.runs} runs are finished and '
                                 'kept, the same command goes on') from None
     return _result(described, table, rows_with_time)
