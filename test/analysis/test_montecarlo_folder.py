@@ -376,6 +376,7 @@ def test_what_a_dead_process_had_is_done_by_another(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures('importable')
 def test_processes_that_die_again_and_again_are_told() -> None:
+    """And all else is done, also what was lost with them."""
     found = []
     with pytest.raises(CampaignError, match='processes of the campaign died'):
         for item in as_ready(imported('die'), list(range(6)), 2):

@@ -80,8 +80,9 @@ def as_ready(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: int
     """
     Do some work for each item as :func:`in_processes`, and return it as soon as it is done.
 
-    Few items are given away beforehand, so there may be any number of them. What a process did
-    that died is done again in another one.
+    Few items are given away beforehand, so there may be any number of them. What was under way when
+    a process died is done again in others: at last, and one by one until something is done, since
+    nobody knows which of it is to blame.
 
     :returns: what the work returned, in the order in which it was ready.
     :raises CampaignError: processes died again and again.
@@ -96,7 +97,7 @@ def as_ready(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: int
         try:
             while waiting or running:
                 with _interrupts_ignored(), _one_thread_each():
-                    while waiting and len(running) <= jobs:
+                    while waiting and len(running) < (1 if died else jobs + 1):
                         future = pool.submit(work, waiting[0])
                         running[future] = waiting.popleft()
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -109,7 +110,7 @@ def as_ready(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: int
             if died > REPLACED:
                 raise CampaignError('processes of the campaign died, by lack of memory perhaps: '
                                     'take fewer --jobs') from None
-            waiting.extendleft(reversed(running.values()))
+            waiting.extend(running.values())
         finally:
             pool.shutdown(cancel_futures=True)
 
