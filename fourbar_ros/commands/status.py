@@ -34,6 +34,9 @@ def run(args: argparse.Namespace) -> int:
     with testbed_client(args) as testbed:
         testbed.follow(*SOURCES.values())
         testbed.wait(lambda: len(testbed.statuses) == len(SOURCES), seconds=3.0)
+        if testbed.device_visible():
+            # On a busy machine it may be seen before it is heard.
+            testbed.wait(lambda: SOURCES['device'] in testbed.statuses)
         statuses = testbed.statuses
     for name, topic in SOURCES.items():
         print(name)
