@@ -241,6 +241,7 @@ def test_interrupt_of_all_processes_ends_them_without_a_word() -> None:
     process.stdout.readline()
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=20.0)
-    assert out.splitlines()[-1] == 'interrupted'
+    # It may come between a word and the end of its line.
+    assert out.endswith('interrupted\n')
     assert err == ''
     assert process.returncode == 0
