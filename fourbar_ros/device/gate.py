@@ -67,9 +67,13 @@ class ArmingGate:
         self._enter(DeviceState.ARMED, 'armed on request', stamp_ns)
         return True, 'armed'
 
-    def disarm(self, stamp_ns: int, reason: str) -> None:
-        """Stop driving; a latched state stays."""
-        if self.armed:
+    def disarm(self, stamp_ns: int, reason: str, parked: bool = False) -> None:
+        """
+        Stop driving; a latched state stays.
+
+        :param parked: whether wheels had power though disarmed, so that there is something to end.
+        """
+        if self.armed or (parked and self.state is DeviceState.DISARMED):
             self._enter(DeviceState.DISARMED, reason, stamp_ns)
 
     def emergency_stop(self, stamp_ns: int, reason: str) -> None:

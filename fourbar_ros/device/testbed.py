@@ -203,8 +203,8 @@ class Testbed:
 
     def disarm(self, reason: str) -> None:
         """Stop driving: the wheels coast, without power."""
-        self._parked = None
-        self.gate.disarm(self._now_ns, reason)
+        parked, self._parked = self._parked is not None, None
+        self.gate.disarm(self._now_ns, reason, parked)
         self._gate_changed()
 
     def emergency_stop(self, reason: str) -> None:

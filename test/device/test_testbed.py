@@ -35,7 +35,7 @@ from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.plant import Fault, InitialState, Plant, PlantError, Table
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelEncoders
-from hypothesis import given, note, settings
+from hypothesis import example, given, note, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.typing import NDArray
@@ -540,6 +540,7 @@ others = st.sampled_from(
 
 
 @settings(deadline=None, max_examples=400, derandomize=True)
+@example(action='hold_speed', events=[('tick', 30.0), ('disarm', None), ('tick', 1.0)])
 @given(
     action=st.sampled_from(['coast', 'hold_speed', 'brake']),
     events=st.lists(st.one_of(ticks, ticks, commands, others.map(lambda name: (name, None))),
