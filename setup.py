@@ -32,7 +32,7 @@ EXTRAS = {
         'dask[distributed]>=2024.1',
         'matplotlib>=3.7',
         'pyarrow>=14',
-        'rosbags>=0.10',
+        'rosbags>=0.10.9',
         'tqdm',
     ],
     'dev': [
@@ -45,7 +45,7 @@ EXTRAS = {
         'colcon-ros>=0.5',
         'colcon-test-result',
         'hypothesis',
-        'mujoco>=3.4',
+        'mujoco>=3.7',
         'mypy',
         'pytest',
         'pytest-xdist',

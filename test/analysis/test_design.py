@@ -28,6 +28,7 @@ from fourbar_ros.plant import load_table
 from fourbar_ros.plant.table import surroundings_of
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 
 NOMINAL, TABLE = load_mechanism('prototype'), load_table('prototype')
 
@@ -55,7 +56,7 @@ def test_energy_is_accounted_for_only_with_all_losses(present: design.Design) ->
         assert design.imbalance(spending, TABLE) < 1e-6
         assert design.imbalance(spending, load_table('ideal')) > 1e-4
         # What is taken from the supplies covers what becomes of it.
-        lost = float(np.trapezoid((spending.bearings * spending.motor_speeds).sum(axis=1),
+        lost = float(trapezoid((spending.bearings * spending.motor_speeds).sum(axis=1),
                                   spending.times))
         assert spending.drawn[-1] > lost + spending.copper[-1]
 

@@ -39,6 +39,7 @@ from fourbar_ros.analysis.studies.inertia_search import (
 from fourbar_ros.mechanism import load_mechanism
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 from scipy.linalg import solveh_banded
 
 pytest.importorskip('cma')
@@ -101,7 +102,7 @@ def test_least_at_a_weight_is_that_of_finite_elements(weight: float) -> None:
     error, eq9 = least_at_weight(weight)
     assert eq9 == pytest.approx(float((np.diff(phi) ** 2).sum() / h) / SQUARED_RATE, rel=1e-5)
     assert error == pytest.approx(
-        TURN * np.sqrt(np.trapezoid((phi - reference) ** 2, s)), rel=1e-4)
+        TURN * np.sqrt(trapezoid((phi - reference) ** 2, s)), rel=1e-4)
 
 
 def test_alike_pairs_are_the_best() -> None:

@@ -43,6 +43,7 @@ from fourbar_ros.mechanism.forces import forces_along
 from fourbar_ros.plant import load_table, Table
 from fourbar_ros.plant.table import surroundings_of
 import numpy as np
+from scipy.integrate import trapezoid
 
 DURATION, THETA = 10.0, pi / 3.0
 # By how much links a and b turn [rad].
@@ -308,8 +309,8 @@ def imbalance(spending: Spending, table: Table) -> float:
                             np.array([surroundings_of(table)])) * spending.link_rates).sum(axis=1)
     gained = [kinetic_energy(mechanism, spending.angles[n], spending.link_rates[n],
                              spending.speeds[n]) for n in (0, -1)]
-    missing = float(np.trapezoid(power - in_bearings + outside, times)) - (gained[1] - gained[0])
-    return abs(missing) / float(np.trapezoid(np.abs(power), times))
+    missing = float(trapezoid(power - in_bearings + outside, times)) - (gained[1] - gained[0])
+    return abs(missing) / float(trapezoid(np.abs(power), times))
 
 
 def _checks(present: Design, answer: Design, looped: Mapping[str, Mapping[str, float]],

@@ -55,6 +55,7 @@ from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.layout import make_state
 import numpy as np
+from scipy.integrate import trapezoid
 
 # Weights of the tracking error along the front, and the one of searches that differ in their seed.
 WEIGHTS = (0.1, 0.03, 0.01, 0.003, 1e-3, 3e-4, 1e-4, 3e-5)
@@ -182,7 +183,7 @@ def flown(candidate: Candidate) -> float:
     angles = fly(nominal, make_state(assemble(nominal, 0.0, np.pi / 3.0)), torques,
                  DURATION / STEPS)
     errors = angles - angles[0] - TURN * SOFT_STEP(shares[::2])[:, None]
-    squared = float(np.trapezoid((errors ** 2).mean(axis=1))) / STEPS
+    squared = float(trapezoid((errors ** 2).mean(axis=1))) / STEPS
     return abs(sqrt(squared) - candidate.error_rms)
 
 

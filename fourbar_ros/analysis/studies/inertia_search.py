@@ -31,6 +31,7 @@ from math import cosh, exp, pi, radians, sinh, sqrt
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 from numpy.polynomial import Polynomial
+from scipy.integrate import trapezoid
 from scipy.optimize import brentq
 from scipy.special import eval_jacobi
 
@@ -211,8 +212,8 @@ def least_at_weight(weight: float) -> tuple[float, float]:
     error = smooth(s) + a * rise + b * fall
     rate = (SOFT_STEP.deriv()(s) + smooth.deriv()(s) + a * root * _cosh_share(root, s)
             - b * root * _cosh_share(root, 1.0 - s))
-    return (TURN * sqrt(float(np.trapezoid(error ** 2, s))),
-            float(np.trapezoid(rate ** 2, s)) / SQUARED_RATE)
+    return (TURN * sqrt(float(trapezoid(error ** 2, s))),
+            float(trapezoid(rate ** 2, s)) / SQUARED_RATE)
 
 
 def least_at_error(error_rms: float) -> float:
