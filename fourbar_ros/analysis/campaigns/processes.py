@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 import contextlib
@@ -39,6 +39,9 @@ THREADS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
 # A process that dies is replaced so often before any work is done again.
 REPLACED = 3
+
+# How often to look whether an interrupt came [s].
+LOOK = 0.2
 
 
 class CampaignError(FourbarError):
@@ -67,6 +70,7 @@ def in_processes(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: 
         with _interrupts_ignored(), _one_thread_each():
             waiting = deque(pool.submit(work, item) for item in items)
         while waiting:
+            _first_of([waiting[0]])
             yield waiting.popleft().result()
     except BrokenProcessPool:
         raise CampaignError('a process of the campaign died, by lack of memory perhaps: take '
@@ -80,9 +84,9 @@ def as_ready(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: int
     """
     Do some work for each item as :func:`in_processes`, and return it as soon as it is done.
 
-    Few items are given away beforehand, so there may be any number of them. What was under way when
-    a process died is done again in others: at last, and one by one until something is done, since
-    nobody knows which of it is to blame.
+    Few items are given away beforehand, so there may be any number of them. What was under way
+    when a process died is done again in others: at last, and one by one until something is done,
+    since nobody knows which of it is to blame.
 
     :returns: what the work returned, in the order in which it was ready.
     :raises CampaignError: processes died again and again.
@@ -100,7 +104,7 @@ def as_ready(work: Callable[[_Item], _Found], items: Sequence[_Item], jobs: int
                     while waiting and len(running) < (1 if died else jobs + 1):
                         future = pool.submit(work, waiting[0])
                         running[future] = waiting.popleft()
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                for future in _first_of(running):
                     found = future.result()
                     del running[future]
                     died = 0
@@ -131,6 +135,42 @@ def _end_together() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
+def _first_of(futures: Collection[Future[_Found]]) -> set[Future[_Found]]:
+    """
+    Wait until some of them are done, and return these.
+
+    :raises KeyboardInterrupt: a moment after it came.
+    """
+    with _interrupts_deferred() as came:
+        while True:
+            done = wait(futures, LOOK, FIRST_COMPLETED).done
+            if done or came:
+                return done
+
+
+@contextlib.contextmanager
+def _interrupts_deferred() -> Iterator[list[int]]:
+    """
+    Let interrupts wait for the end of this block.
+
+    One that comes while this thread takes a lock may leave it locked, and with it the thread of
+    the pool that hands on results: neither of them ever ends then.
+
+    :returns: those that came so far.
+    """
+    came: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield came
+        return
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield came
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if came:
+            signal.raise_signal(signal.SIGINT)
+
+
 @contextlib.contextmanager
 def _interrupts_ignored() -> Iterator[None]:
     """
@@ -143,17 +183,13 @@ def _interrupts_ignored() -> Iterator[None]:
         return
     # It unblocks interrupts when it starts, so it has to be there before.
     resource_tracker.ensure_running()
-    came: list[int] = []
     # Blocked in this thread alone: another one of this process may still take it.
-    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        signal.signal(signal.SIGINT, before)
-        if came:
-            signal.raise_signal(signal.SIGINT)
+    with _interrupts_deferred():
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 @contextlib.contextmanager
