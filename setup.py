@@ -32,7 +32,7 @@ EXTRAS = {
         'dask[distributed]>=2024.1',
         'matplotlib>=3.7',
         'pyarrow>=14',
-        'rosbags>=0.10.9',
+        'rosbags>=0.11',
         'tqdm',
     ],
     'dev': [

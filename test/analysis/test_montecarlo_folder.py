@@ -46,7 +46,7 @@ import pyarrow.parquet
 import pytest
 from tqdm import tqdm
 
-PATIENCE = 60.0
+PATIENCE = 300.0
 
 
 @pytest.fixture
