@@ -137,9 +137,9 @@ class Prototype(Device):
         self._open_bus = open_bus
         self._bus: Bus | None = open_bus()
         # When it may be opened again, if that has failed.
-        self._rateless: set[str] = set()
         self._retry_ns: int | None = None
         self._refusal = ''
+        self._rateless: set[str] = set()
         self._steady_ns = steady_ns
         self._stamp_of = stamp_of
         self._answer_timeout_ns = round(answer_timeout_s * 1e9)
