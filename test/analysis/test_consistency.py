@@ -227,9 +227,11 @@ def test_process_that_dies_is_told() -> None:
 
 @pytest.mark.node
 def test_interrupt_of_all_processes_ends_them_without_a_word() -> None:
-    code = ('import time\n'
+    # Whoever was started in the background ignores interrupts.
+    code = ('import signal, time\n'
             'from fourbar_ros.analysis.campaigns.processes import in_processes\n'
             'if __name__ == "__main__":\n'
+            '    signal.signal(signal.SIGINT, signal.default_int_handler)\n'
             '    try:\n'
             '        for _ in in_processes(time.sleep, [0.2] * 500, 2):\n'
             '            print("running", flush=True)\n'

@@ -347,6 +347,15 @@ def importable(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     sys.modules.pop('test_montecarlo_folder', None)
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Let interrupts reach this process: one in the background of a shell ignores them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures('interruptible')
 def test_interrupt_while_processes_are_started_is_not_lost() -> None:
     """And is for this process alone."""
     asked = 'import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))'
