@@ -25,6 +25,8 @@ pytestmark = pytest.mark.node
 
 PERIOD_S = 0.004
 # As the harness starts plants.
+# Others forget a node that died after 20 s.
+FORGOTTEN_S = 60.0
 COMMAND_TIMEOUT_S = 1.0
 # Ticks that a command may be under way on a busy machine.
 A_FEW_TICKS_S = 25 * PERIOD_S
@@ -301,7 +303,7 @@ def test_lost_controller_leaves_the_wheels_coasting(moving, make_probe, number):
         # end of the module does, locks Fast DDS up for ever.
         topic = watcher.node.resolve_topic_name('flywheel_command')
         for each in make_probe.probes:
-            watcher.wait(lambda node=each.node: node.count_publishers(topic) == 0)
+            watcher.wait(lambda node=each.node: node.count_publishers(topic) == 0, FORGOTTEN_S)
         return
     # It comes back and finds the device disarmed: no goal, no torque.
     controller.send(signal.SIGCONT)
