@@ -25,7 +25,13 @@ import sys
 import time
 from typing import Any
 
-from fourbar_ros.commands.files import check_new_folder, OutputError, whole_folder, write_files
+from fourbar_ros.commands.files import (
+    check_file,
+    check_new_folder,
+    OutputError,
+    whole_folder,
+    write_files,
+)
 from fourbar_ros.commands.progress import show_progress
 from fourbar_ros.commands.ros import add_ros_arguments, testbed_client
 from fourbar_ros.commands.setpoint import parse_goal
@@ -167,8 +173,7 @@ def _check_outputs(args: argparse.Namespace) -> None:
     for path in _files(args):
         if path.exists() and not args.force:
             raise OutputError(f'{path} exists already: choose another name or give --force')
-        if not path.absolute().parent.is_dir():
-            raise OutputError(f'cannot write {path}: no such folder')
+        check_file(path)
     figure = getattr(args, 'figure', None)
     if figure is not None and figure.suffix not in ('.png', '.svg'):
         raise OutputError(f'cannot write {figure}: a picture is .png or .svg')

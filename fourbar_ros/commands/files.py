@@ -38,8 +38,7 @@ def write_whole(path: Path) -> Iterator[TextIO]:
     :raises OutputError: the folder is missing or not writable, the disk is full, or the path is
         a folder, a pipe or a device.
     """
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise OutputError(f'cannot write {path}: it is not a regular file')
+    _check_regular(path)
     name = ''
     try:
         with tempfile.NamedTemporaryFile(
@@ -80,8 +79,7 @@ def check_file(path: Path) -> None:
     parent = path.absolute().parent
     if not parent.is_dir():
         raise OutputError(f'cannot write {path}: no such folder')
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise OutputError(f'cannot write {path}: it is not a regular file')
+    _check_regular(path)
     if not os.access(parent, os.W_OK | os.X_OK):
         raise OutputError(f'cannot write {path}: {parent} is not writable')
 
@@ -143,6 +141,11 @@ def whole_folder(folder: Path) -> Iterator[Path]:
             os.rename(made, folder)
     except OSError as error:
         raise OutputError(f'cannot write {folder}: {error.strerror or error}') from None
+
+
+def _check_regular(path: Path) -> None:
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise OutputError(f'cannot write {path}: it is not a regular file')
 
 
 def _umask() -> int:
