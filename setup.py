@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Install the package, for pip and for colcon alike; package.xml lists the same for rosdep."""
 
@@ -89,9 +78,9 @@ setup(
     ],
     extras_require=EXTRAS,
     entry_points={
-        'console_scripts': [f'fourbar = {PACKAGE}.commands.main:main'],
+        'console_scripts': [f'fourbar = {PACKAGE}.cli.main:main'],
         # What python-can calls a bus by: `interface: fourbar_udp`.
-        'can.interface': [f'fourbar_udp = {PACKAGE}.device.prototype.udp_bus:UdpBus'],
+        'can.interface': [f'fourbar_udp = {PACKAGE}.hardware.udp_bus:UdpBus'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Draw the figures of the documents but those of studies: `.venv/bin/python docs/figures.py`."""
 
 from __future__ import annotations
@@ -23,13 +12,12 @@ from fourbar_ros.analysis.calibration.figure import links_figure, wheels_figure
 from fourbar_ros.analysis.calibration.links import link_estimate
 from fourbar_ros.analysis.calibration.signals import link_signal, LinkSignal, WheelSignal
 from fourbar_ros.analysis.calibration.wheels import wheel_estimate
-from fourbar_ros.analysis.style import COLOURS, legend_above, LINK_COLOURS, RC
 from fourbar_ros.control import Controller, ControllerSettings
 from fourbar_ros.device import SimulatedTable
 from fourbar_ros.device.command import drive_by_name
-from fourbar_ros.device.protocol import no_torque
+from fourbar_ros.device.interface import no_torque
 from fourbar_ros.estimation import Estimator, EstimatorSettings
-from fourbar_ros.estimation.suspicion import ALARM
+from fourbar_ros.estimation.bias_detection import ALARM
 from fourbar_ros.loop.run import make_loop
 from fourbar_ros.loop.scenario import load_scenario
 from fourbar_ros.mechanism import (
@@ -41,12 +29,13 @@ from fourbar_ros.mechanism import (
 )
 from fourbar_ros.mechanism.forces import NOTHING
 from fourbar_ros.mechanism.geometry import joint_positions
-from fourbar_ros.mechanism.layout import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
-from fourbar_ros.mechanism.motion import move_held, move_with_cosines
+from fourbar_ros.mechanism.integration import move_held, move_with_cosines
+from fourbar_ros.mechanism.state import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
 from fourbar_ros.plant import Fault, InitialState, LinkSensorSettings, load_table, Plant, Table
 from fourbar_ros.plant.bearings import bearing_torque, drives_of
-from fourbar_ros.plant.ledger import Ledger
+from fourbar_ros.plant.energy_budget import EnergyBudget
 from fourbar_ros.plant.table import WheelEncoders
+from fourbar_ros.plotting.style import COLOURS, legend_above, LINK_COLOURS, RC
 from matplotlib import pyplot, rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -254,7 +243,7 @@ def energy() -> Figure:
     return figure
 
 
-def quarter_turn() -> tuple[Array, list[Ledger]]:
+def quarter_turn() -> tuple[Array, list[EnergyBudget]]:
     """
     Turn the prototype by 90 degrees in 10 s, seed 0, the controller knowing the true state.
 

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Documents that are made from the code, or that people type from, say what is true."""
 
@@ -21,16 +10,16 @@ from pathlib import Path
 import re
 from typing import Any
 
-from fourbar_ros.commands.main import COMMANDS
-from fourbar_ros.configuration import config_file, load_yaml
-from fourbar_ros.device.prototype.safety import LEAST, load_safety
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.cli.main import COMMANDS
+from fourbar_ros.common.config_files import config_file, load_yaml
+from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.hardware.safety_table import LEAST, load_safety
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism
-from fourbar_ros.nodes.tables import markdown_text, prototype_text, yaml_text
+from fourbar_ros.plant.energy_budget import EnergyBudget
+from fourbar_ros.plant.fault_schedule import parse_schedule, read_schedule
 from fourbar_ros.plant.faults import FaultKind, SENSOR_FAULTS, WHEEL_FAULTS
-from fourbar_ros.plant.ledger import Ledger
-from fourbar_ros.plant.schedule import parse_schedule, read_schedule
 from fourbar_ros.plant.table import SECTIONS
+from fourbar_ros.ros.tables import markdown_text, prototype_text, yaml_text
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -38,17 +27,17 @@ PAGES = sorted([ROOT / 'README.md', *(ROOT / 'docs').glob('*.md')])
 
 
 def test_parameter_tables_are_those_of_the_nodes() -> None:
-    """Regenerate with `python -m fourbar_ros.nodes.tables --markdown`."""
+    """Regenerate with `python -m fourbar_ros.ros.tables --markdown`."""
     assert markdown_text() in (ROOT / 'docs' / 'topics.md').read_text()
 
 
 def test_parameters_file_is_that_of_the_nodes() -> None:
-    """Regenerate with `python -m fourbar_ros.nodes.tables > config/nodes.yaml`."""
+    """Regenerate with `python -m fourbar_ros.ros.tables > config/nodes.yaml`."""
     assert (ROOT / 'config' / 'nodes.yaml').read_text() == yaml_text()
 
 
 def test_parameters_file_of_the_prototype_is_that_of_its_scenario() -> None:
-    """Regenerate with `python -m fourbar_ros.nodes.tables --prototype`, and so on."""
+    """Regenerate with `python -m fourbar_ros.ros.tables --prototype`, and so on."""
     assert (ROOT / 'config' / 'nodes_prototype.yaml').read_text() == prototype_text()
 
 
@@ -149,7 +138,7 @@ def test_schedule_of_the_page_is_one(tmp_path: Path) -> None:
 
 
 def test_entries_of_the_accounts_are_told() -> None:
-    assert list(table_under('## The accounts')) == [item.name for item in fields(Ledger)]
+    assert list(table_under('## The accounts')) == [item.name for item in fields(EnergyBudget)]
 
 
 @pytest.mark.parametrize('heading', ['## Motors', '## Mechanisms'])

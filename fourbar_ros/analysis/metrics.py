@@ -1,21 +1,10 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 What a recording says about one setpoint: tracking, estimate, wheels, energy, loop timing.
 
-All samples count by their stamps; see :mod:`fourbar_ros.analysis.motion` for which.
+All samples count by their stamps; see :mod:`fourbar_ros.analysis.manoeuvre` for which.
 """
 
 from __future__ import annotations
@@ -25,7 +14,7 @@ from typing import Any, NamedTuple
 import warnings
 
 from fourbar_ros.analysis.bags import BagError, Floats, JointSeries, Nanoseconds, Recording
-from fourbar_ros.analysis.motion import find_motion, Motion, pair, Paired
+from fourbar_ros.analysis.manoeuvre import find_motion, Motion, pair, Paired
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.angles import wrap_angles
 import numpy as np

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The estimator over a recorded bag: a new bag with other estimates, and both sides by the numbers.
@@ -30,9 +19,9 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from fourbar_ros.analysis.bags import BagError, DIAGNOSTIC_STATUS, JOINT_STATE, JointSeries
-from fourbar_ros.analysis.progress import Progress
-from fourbar_ros.analysis.stored import copier, open_bag, StoredBag
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.analysis.stored_bag import copier, open_bag, StoredBag
+from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.progress import Progress
 from fourbar_ros.estimation import EstimatorSettings
 from fourbar_ros.estimation.parameters import PARAMETERS
 from fourbar_ros.estimation.topics import (

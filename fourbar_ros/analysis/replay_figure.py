@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The figure of a replay: both estimates beside the truth, how far they are apart, and NIS."""
 
@@ -19,11 +8,11 @@ from __future__ import annotations
 import io
 from typing import Any
 
-from fourbar_ros.analysis import style
 from fourbar_ros.analysis.bags import Floats
 from fourbar_ros.analysis.replay import Side
 from fourbar_ros.analysis.replay_comparison import Comparison, Difference
-from fourbar_ros.analysis.style import COLOURS, decimate, LINK_COLOURS, LINK_DASHES
+from fourbar_ros.plotting import style
+from fourbar_ros.plotting.style import COLOURS, decimate, LINK_COLOURS, LINK_DASHES
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """One self-contained HTML page and one JSON file from a bag."""
 
@@ -25,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from fourbar_ros.analysis.bags import BagError, read_bag, Recording
+from fourbar_ros.analysis.manoeuvre import find_motion
 from fourbar_ros.analysis.metrics import MEANINGS, metrics
-from fourbar_ros.analysis.motion import find_motion
-from fourbar_ros.analysis.progress import Progress
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.progress import Progress
 from fourbar_ros.mechanism import load_mechanism, Mechanism
 import numpy as np
 
@@ -127,7 +116,8 @@ def _write(path: Path, text: str) -> None:
 def make_page(recording: Recording, mechanism: Mechanism | None, result: dict[str, Any],
               progress: Progress | None = None) -> str:
     """Return the HTML page for the metrics of a recording."""
-    from fourbar_ros.analysis import figures, style
+    from fourbar_ros.analysis import report_figures as figures
+    from fourbar_ros.plotting import style
 
     view = figures.View(recording, find_motion(recording), mechanism)
     parts = []

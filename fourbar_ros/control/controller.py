@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The controller: estimates and setpoints in, wheel commands out, one set per tick."""
 
@@ -20,25 +9,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import exp, pi, sin
 
-from fourbar_ros.control.accounts import Accounts, LONGEST_PERIOD
+from fourbar_ros.control.actuation_cost import Accounts, LONGEST_PERIOD
 from fourbar_ros.control.branch import Branch, LINKS_ALONE
-from fourbar_ros.control.choice import choose
-from fourbar_ros.control.drive import WheelCommand, WheelDrive
+from fourbar_ros.control.branch_selection import choose
 from fourbar_ros.control.feasibility import (
     check_needs,
     shortest_duration,
     wheel_loads,
     Wheels,
 )
-from fourbar_ros.control.guide import Guide
-from fourbar_ros.control.law import TrackingLaw
-from fourbar_ros.control.momentum import MomentumWatch
-from fourbar_ros.control.reference import SoftStep, Way
+from fourbar_ros.control.momentum_margin import MomentumMonitor
+from fourbar_ros.control.reference_generator import ReferenceGenerator
 from fourbar_ros.control.setpoint import check_names, follow, SetpointError
 from fourbar_ros.control.settings import ControllerSettings
+from fourbar_ros.control.soft_step import SoftStep, TrajectorySegment
 from fourbar_ros.control.stability import check_gains, GainError
+from fourbar_ros.control.tracking_law import TrackingLaw
 from fourbar_ros.control.trajectory import Point, read_trajectory
-from fourbar_ros.control.wheel_watch import SHORTED, WheelWatch
+from fourbar_ros.control.wheel_command import WheelCommand, WheelCommander
+from fourbar_ros.control.wheel_fault_detection import SHORTED, WheelFaultDetector
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, Mechanism
 from fourbar_ros.mechanism.closure import branch_of
 from fourbar_ros.mechanism.constants import Array
@@ -122,11 +111,11 @@ class Controller:
         self.problem = ''
         self.saturated = 0
         self.law = TrackingLaw(mechanism)
-        self.momentum = MomentumWatch(mechanism)
-        self.wheels = WheelWatch(mechanism)
+        self.momentum = MomentumMonitor(mechanism)
+        self.wheels = WheelFaultDetector(mechanism)
         self.mechanism = mechanism
-        self._guide = Guide(mechanism)
-        self._drive = WheelDrive(mechanism)
+        self._guide = ReferenceGenerator(mechanism)
+        self._drive = WheelCommander(mechanism)
         self._accounts = Accounts(mechanism)
         self._armed = False
         self._enabled = True
@@ -464,7 +453,7 @@ class Controller:
             self._guide.goal = None
         self.mode = 'hold'
 
-    def _accept(self, way: Way, goal: Array) -> None:
+    def _accept(self, way: TrajectorySegment, goal: Array) -> None:
         assert self._stamp_ns is not None
         self._guide.go(way, goal, self._stamp_ns)
         self.mode, self.problem = 'track', ''

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 What a planned motion needs of the wheels, and whether the motors can give it.
@@ -31,16 +20,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import ceil, inf
 
-from fourbar_ros.control.axes import pair_terms
 from fourbar_ros.control.branch import Branch, branch_at, LINKS_ALONE
-from fourbar_ros.control.reference import SoftStep, Way
+from fourbar_ros.control.computed_torque import pair_terms
 from fourbar_ros.control.setpoint import (
     angles_along,
     follow,
     SetpointError,
 )
+from fourbar_ros.control.soft_step import SoftStep, TrajectorySegment
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism import ClosureError, FLYWHEEL_NAMES, Mechanism
-from fourbar_ros.mechanism.compiled import kernel
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import reduced_terms_at
 import numpy as np
@@ -109,7 +98,7 @@ class Needs:
     unmet: float
 
 
-def needs_of(mechanism: Mechanism, way: Way, present: Array, wheels: Wheels,
+def needs_of(mechanism: Mechanism, way: TrajectorySegment, present: Array, wheels: Wheels,
              branch: Branch | None = None) -> Needs:
     """
     Work out what a motion needs of the wheels.
@@ -137,7 +126,7 @@ def needs_of(mechanism: Mechanism, way: Way, present: Array, wheels: Wheels,
                  np.abs(_voltages(mechanism, speeds, torques)).max(axis=0), speeds[-1], unmet)
 
 
-def check_needs(mechanism: Mechanism, way: Way, present: Array, wheels: Wheels, *,
+def check_needs(mechanism: Mechanism, way: TrajectorySegment, present: Array, wheels: Wheels, *,
                 share: float = SHARE, crossing: bool = False, branch: Branch | None = None
                 ) -> Needs:
     """

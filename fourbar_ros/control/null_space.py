@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 What wheels can do to each other without moving a link.
@@ -22,9 +11,9 @@ two, which is what keeps wheels off their speed limits and away from standstill.
 
 from __future__ import annotations
 
+from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.control.allocation import principal_axes, ROUNDING
-from fourbar_ros.errors import FourbarError
-from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 

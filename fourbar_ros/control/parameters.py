@@ -1,21 +1,11 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The parameters of the controller: for its node and for scenarios."""
 
 from __future__ import annotations
 
+from fourbar_ros.common.settings import Parameter
 from fourbar_ros.control.allocation import ALLOCATIONS
 from fourbar_ros.control.settings import (
     CHANGE_POINTS,
@@ -24,7 +14,6 @@ from fourbar_ros.control.settings import (
     TIMINGS,
     WHEEL_TARGETS,
 )
-from fourbar_ros.parameters import Parameter
 
 _DEFAULTS = ControllerSettings()
 

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What a setpoint by link names means, and whether it can be reached."""
 
@@ -20,17 +9,17 @@ from collections.abc import Iterator, Sequence
 from itertools import product
 from math import ceil, pi, sin
 
+from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.named_values import RejectedError, values_by_name
 from fourbar_ros.control.branch import (
     Branch,
     branch_at,
     opposite_links_equal,
     PARALLELOGRAM,
 )
-from fourbar_ros.control.reference import SoftStep, Way
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.control.soft_step import SoftStep, TrajectorySegment
 from fourbar_ros.mechanism import ClosureError, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.angles import wrap
-from fourbar_ros.mechanism.by_name import RejectedError, values_by_name
 from fourbar_ros.mechanism.closure import assemble_along, assemblies
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
@@ -170,7 +159,8 @@ def complete(mechanism: Mechanism, goals: dict[int, float], present: Array, last
         raise SetpointError(str(error)) from None
 
 
-def follow(mechanism: Mechanism, move: Way, present: Array, *, crossing: bool = False,
+def follow(mechanism: Mechanism, move: TrajectorySegment, present: Array, *,
+           crossing: bool = False,
            branch: Branch | None = None) -> Array:
     """
     Follow a planned move.
@@ -306,7 +296,7 @@ def _check_distance(mechanism: Mechanism, angles: Array, crossing: bool,
             f'a change point{reason}')
 
 
-def _paths(move: Way) -> Iterator[Array]:
+def _paths(move: TrajectorySegment) -> Iterator[Array]:
     """Sample the angles of links a and b, and again where that is not fine enough: (n, 2)."""
     times = move.instants(CHECKS)
     path = move.sample(times)[:, 0]

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Trajectories: several goals with times, as of trajectory_msgs/JointTrajectory.
@@ -29,7 +18,6 @@ from functools import cached_property
 from math import ceil, isfinite
 
 from fourbar_ros.control.branch import Branch, branch_at
-from fourbar_ros.control.reference import evaluate, evaluate_many, quintic
 from fourbar_ros.control.setpoint import (
     AGREEMENT,
     check_agreement,
@@ -40,6 +28,7 @@ from fourbar_ros.control.setpoint import (
     SetpointError,
     shortest_ways,
 )
+from fourbar_ros.control.soft_step import evaluate, evaluate_many, quintic
 from fourbar_ros.mechanism import LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.closure import SIGNS
 from fourbar_ros.mechanism.constants import Array

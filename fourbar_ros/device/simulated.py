@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The simulated table as a device."""
 
@@ -19,14 +8,14 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-from fourbar_ros.device.protocol import Device, Drive, no_torque, Samples, WheelSample
+from fourbar_ros.device.interface import Device, Drive, no_torque, Samples, WheelSample
 from fourbar_ros.mechanism import FLYWHEEL_NAMES
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plant import Fault, InitialState, Plant
+from fourbar_ros.plant.energy_budget import EnergyBudget
+from fourbar_ros.plant.fault_schedule import FaultBoard, FaultChange
 from fourbar_ros.plant.faults import WHEEL_FAULTS, wheel_faults
-from fourbar_ros.plant.ledger import Ledger
-from fourbar_ros.plant.motion import conditions_of, SOUND
-from fourbar_ros.plant.schedule import FaultBoard, FaultChange
+from fourbar_ros.plant.step import conditions_of, SOUND
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,7 +26,7 @@ class SimulatedTable(Device):
 
     :param plant: what is simulated.
     :param period_ns: time between two ticks [ns].
-    :ivar faults: what is broken; change it by `break_down` and `schedule_faults`.
+    :ivar injected_faults: what is broken; change it by `break_down` and `schedule_faults`.
     :raises PlantError: the period is not a whole multiple of the plant step.
     """
 
@@ -48,7 +37,7 @@ class SimulatedTable(Device):
         self.period_ns = period_ns
         self.sensor_names = plant.link_sensors.names
         self.measures_rates = plant.link_sensors.settings.gyro
-        self.faults = FaultBoard((*self.sensor_names, *FLYWHEEL_NAMES))
+        self.injected_faults = FaultBoard((*self.sensor_names, *FLYWHEEL_NAMES))
         self._plant = plant
         self._steps_per_period = plant.steps_in(period_ns * 1e-9)
         self._step_ns = period_ns // self._steps_per_period
@@ -77,7 +66,7 @@ class SimulatedTable(Device):
 
         :raises FaultError: there is no such sensor or wheel.
         """
-        self.faults.set_fault(target, fault)
+        self.injected_faults.set_fault(target, fault)
         self._apply_faults()
 
     def schedule_faults(self, entries: Any, origin: str) -> None:
@@ -88,7 +77,7 @@ class SimulatedTable(Device):
         :param origin: where they come from, for messages.
         :raises FaultError: the schedule is refused; then nothing was changed.
         """
-        self.faults.load(entries, origin, self._elapsed_ns)
+        self.injected_faults.load(entries, origin, self._elapsed_ns)
         self._apply_faults()
 
     def step(self, stamp_ns: int, drive: Drive) -> Samples:
@@ -111,17 +100,17 @@ class SimulatedTable(Device):
             WheelSample(wheel_angles, speeds, efforts),
             self._plant.truth(efforts))
 
-    def diagnosis(self) -> dict[str, str]:
+    def diagnostics(self) -> dict[str, str]:
         """Tell what is broken, and whether the linkage has met the edge of the table."""
         told = {}
-        if self.faults.faults:
+        if self.injected_faults.faults:
             told['faults'] = ', '.join(
-                f'{target} {fault}' for target, fault in self.faults.faults.items())
+                f'{target} {fault}' for target, fault in self.injected_faults.faults.items())
         if contacts := self._plant.contacts:
             told['edge'] = f'the linkage has met the edge of the table, {contacts} contacts'
         return told
 
-    def ledger(self) -> Ledger:
+    def ledger(self) -> EnergyBudget:
         """Draw up the accounts of energy and momentum since the start or the last reset."""
         return self._plant.ledger()
 
@@ -181,13 +170,13 @@ class SimulatedTable(Device):
                     self._asked[-1][1])
 
     def _follow_schedule(self) -> tuple[FaultChange, ...]:
-        changes = self.faults.at_time(self._elapsed_ns)
+        changes = self.injected_faults.at_time(self._elapsed_ns)
         if changes:
             self._apply_faults()
         return changes
 
     def _apply_faults(self) -> None:
-        present = self.faults.faults
+        present = self.injected_faults.faults
         self._plant.link_sensors.set_faults(present)
         broken = wheel_faults(present.values())
         self._conditions = conditions_of(broken)

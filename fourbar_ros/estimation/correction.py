@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Kernel of the correction: what measured angles and rates make of the state."""
 
@@ -18,10 +7,10 @@ from __future__ import annotations
 
 from math import pi, sqrt
 
-from fourbar_ros.estimation.elastic import take_lengths
+from fourbar_ros.estimation.bias_detection import FAULTY, judge, seen_again, VERDICT, weigh
+from fourbar_ros.estimation.compliant_closure import take_lengths
 from fourbar_ros.estimation.prediction import meet
-from fourbar_ros.estimation.suspicion import FAULTY, judge, seen_again, VERDICT, weigh
-from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 from numpy.typing import NDArray

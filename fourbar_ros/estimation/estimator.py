@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The estimator: measured angles and ticks in, estimates out, one per tick.
@@ -31,6 +20,7 @@ from itertools import combinations
 from math import isfinite, pi, sin
 from typing import NamedTuple
 
+from fourbar_ros.common.named_values import RejectedError
 from fourbar_ros.estimation.correction import LEFT_OUT, REFUSED
 from fourbar_ros.estimation.estimate import (
     ACCEPTED,
@@ -45,13 +35,12 @@ from fourbar_ros.estimation.estimate import (
     REPEATS,
 )
 from fourbar_ros.estimation.filter import Correction, GYROS, LinkageFilter, Snapshot
-from fourbar_ros.estimation.health import SensorHealth
-from fourbar_ros.estimation.layout import ANGLES, RATES, TORQUES
+from fourbar_ros.estimation.filter_state import ANGLES, RATES, TORQUES
 from fourbar_ros.estimation.measurement import Measurement, read_measurement, sensor_name
+from fourbar_ros.estimation.sensor_health import SensorHealth
 from fourbar_ros.estimation.settings import EstimatorSettings
 from fourbar_ros.mechanism import ClosureError, Mechanism, SENSOR_NAMES
 from fourbar_ros.mechanism.angles import wrap_angles
-from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.mechanism.closure import assemblies
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.constrained import project_onto_closure

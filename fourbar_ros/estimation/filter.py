@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Extended Kalman filter of the linkage.
@@ -27,9 +16,17 @@ from math import inf, sqrt
 from typing import NamedTuple
 
 from filterpy.kalman import ExtendedKalmanFilter
+from fourbar_ros.estimation.bias_detection import (
+    BIAS,
+    FAULTY,
+    LIKELIHOOD,
+    no_suspicions,
+    SUSPECTED,
+    VERDICT,
+)
+from fourbar_ros.estimation.compliant_closure import turned_by_lengths
 from fourbar_ros.estimation.correction import correct, USED
-from fourbar_ros.estimation.elastic import turned_by_lengths
-from fourbar_ros.estimation.layout import (
+from fourbar_ros.estimation.filter_state import (
     ANGLES,
     BIASES,
     FREE,
@@ -39,19 +36,11 @@ from fourbar_ros.estimation.layout import (
     TORQUES,
 )
 from fourbar_ros.estimation.prediction import near_change_point, predict
-from fourbar_ros.estimation.suspicion import (
-    BIAS,
-    FAULTY,
-    LIKELIHOOD,
-    no_suspicions,
-    SUSPECTED,
-    VERDICT,
-)
 from fourbar_ros.mechanism import JOINT_LINKS, Mechanism, SENSOR_NAMES
 from fourbar_ros.mechanism.closure import SIGNS
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix
-from fourbar_ros.mechanism.layout import STATE_SIZE
+from fourbar_ros.mechanism.state import STATE_SIZE
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -84,7 +73,7 @@ PULL_KNOWN_TO = 0.2
 Snapshot = tuple[Array, Array, Array, tuple[int, ...]]
 
 
-class Randomness(NamedTuple):
+class ProcessNoise(NamedTuple):
     """
     What acts on the linkage at random, as densities.
 
@@ -132,7 +121,7 @@ class _Layout(NamedTuple):
     spared: NDArray[np.bool_]
 
 
-def _slack(mechanism: Mechanism, randomness: Randomness) -> Array:
+def _slack(mechanism: Mechanism, randomness: ProcessNoise) -> Array:
     """Return what the kernels are told of a loop that may fail to close, see elastic."""
     if not randomness.closure:
         return np.zeros(0)
@@ -185,7 +174,7 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
     """
 
     def __init__(self, mechanism: Mechanism, angles: Array, angle_variance: float,
-                 rate_variance: float, randomness: Randomness) -> None:
+                 rate_variance: float, randomness: ProcessNoise) -> None:
         super().__init__(dim_x=LOOSE_BIASES if randomness.closure else BIASES, dim_z=4)
         # An array of one: a record by itself takes longer to hand to a kernel than it runs.
         self._constants = np.array(

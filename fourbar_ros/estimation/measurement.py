@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What was measured at one time, as the estimator keeps it."""
 
@@ -20,10 +9,10 @@ from collections.abc import Sequence
 from math import isnan, nan
 from typing import NamedTuple
 
+from fourbar_ros.common.named_values import values_by_name
 from fourbar_ros.estimation.filter import GYROS
 from fourbar_ros.mechanism import JOINT_LINKS, SENSOR_NAMES
 from fourbar_ros.mechanism.angles import wrap
-from fourbar_ros.mechanism.by_name import values_by_name
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Kernels of the prediction: where the linkage goes, and what becomes of what is known.
@@ -29,7 +18,8 @@ from __future__ import annotations
 
 from math import ceil, sin
 
-from fourbar_ros.estimation.elastic import (
+from fourbar_ros.estimation.bias_detection import carry_suspicion, SCALARS
+from fourbar_ros.estimation.compliant_closure import (
     add_elasticity,
     FASTEST,
     lighten,
@@ -40,9 +30,8 @@ from fourbar_ros.estimation.elastic import (
     turned_by_lengths,
     WALK,
 )
-from fourbar_ros.estimation.layout import LOOSE_BIASES
-from fourbar_ros.estimation.suspicion import carry_suspicion, SCALARS
-from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.estimation.filter_state import LOOSE_BIASES
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.constrained import (
     advance_constrained,
@@ -58,7 +47,7 @@ from fourbar_ros.mechanism.constrained import (
 )
 from fourbar_ros.mechanism.dynamics import gamma_matrix, mass_matrix
 from fourbar_ros.mechanism.forces import NOTHING
-from fourbar_ros.mechanism.motion import advance_state
+from fourbar_ros.mechanism.integration import advance_state
 from fourbar_ros.mechanism.reduced import close_reduced, NEAR_ALIGNMENT
 import numpy as np
 from numpy.typing import NDArray

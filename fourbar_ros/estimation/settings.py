@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the filter assumes of the sensors and of the world."""
 
@@ -19,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import pi
 
-from fourbar_ros.estimation.filter import GYROS, Randomness
+from fourbar_ros.estimation.filter import GYROS, ProcessNoise
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 from scipy.special import ndtri
@@ -69,7 +58,7 @@ class EstimatorSettings:
         return np.repeat([self.angle_variance, self.gyro_noise ** 2], GYROS)
 
     @property
-    def randomness(self) -> Randomness:
+    def randomness(self) -> ProcessNoise:
         """What acts on the linkage at random."""
-        return Randomness(self.disturbance_torque, self.disturbance_walk, self.gyro_walk,
+        return ProcessNoise(self.disturbance_torque, self.disturbance_walk, self.gyro_walk,
                           self.closure_tolerance)

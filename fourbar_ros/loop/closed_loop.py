@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The closed loop in one process: what the nodes do over topics, call by call.
@@ -24,12 +13,12 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass
 
+from fourbar_ros.common.named_values import RejectedError
 from fourbar_ros.control import Control, Controller
-from fourbar_ros.control.drive import by_name
-from fourbar_ros.device import Samples, Testbed
-from fourbar_ros.device.pacing import FIRST_STAMP_NS
+from fourbar_ros.control.wheel_command import by_name
+from fourbar_ros.device import DeviceSupervisor, Samples
+from fourbar_ros.device.clock_modes import FIRST_STAMP_NS
 from fourbar_ros.estimation import Estimate, Estimator
-from fourbar_ros.mechanism.by_name import RejectedError
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +38,8 @@ class ClosedLoop:
     :param estimator, controller: made for the same mechanism.
     """
 
-    def __init__(self, testbed: Testbed, estimator: Estimator, controller: Controller) -> None:
+    def __init__(self, testbed: DeviceSupervisor, estimator: Estimator, controller: Controller
+                 ) -> None:
         self.testbed = testbed
         self.estimator = estimator
         self.controller = controller

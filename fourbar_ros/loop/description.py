@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A scenario as one plain mapping, nothing left to defaults and nothing in other files."""
 
@@ -22,8 +11,8 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.configuration import config_file, load_yaml
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.common.config_files import config_file, load_yaml
+from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.loop.scenario import scenario_from, ScenarioError
 from fourbar_ros.mechanism import Mechanism
 

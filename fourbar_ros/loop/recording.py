@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Everything that the nodes would publish in a run, as arrays and as a table."""
 
@@ -19,8 +8,8 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterator, Sequence
 
-from fourbar_ros.control.accounts import ENERGIES
-from fourbar_ros.control.drive import WheelCommand
+from fourbar_ros.control.actuation_cost import ENERGIES
+from fourbar_ros.control.wheel_command import WheelCommand
 from fourbar_ros.loop.closed_loop import Step
 from fourbar_ros.mechanism import JOINT_NAMES, LINK_NAMES, SENSOR_NAMES
 from fourbar_ros.mechanism.constants import Array

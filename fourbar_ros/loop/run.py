@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Run a scenario in one process, without ROS."""
 
@@ -19,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
+from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.control import Controller, SetpointError
-from fourbar_ros.device import SimulatedTable, Testbed, TestbedSettings
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.device import DeviceSupervisor, SimulatedTable, SupervisorSettings
 from fourbar_ros.estimation import Estimator
 from fourbar_ros.loop.closed_loop import ClosedLoop, Step
 from fourbar_ros.loop.recording import Recording
@@ -44,7 +33,7 @@ def make_loop(scenario: Scenario) -> ClosedLoop:
     settings = scenario.plant
     plant = Plant(scenario.mechanism, scenario.table, scenario.initial, settings.step,
                   np.random.default_rng(scenario.seed))
-    testbed = Testbed(SimulatedTable(plant, settings.period_ns), TestbedSettings(
+    testbed = DeviceSupervisor(SimulatedTable(plant, settings.period_ns), SupervisorSettings(
         settings.command_timeout, settings.sensor_timeout, settings.timeout_action))
     return ClosedLoop(testbed, Estimator(scenario.believed, scenario.estimator),
                       Controller(scenario.believed, scenario.controller))

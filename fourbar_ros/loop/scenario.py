@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 A scenario: everything that makes a run of the closed loop the same one every time.
@@ -27,17 +16,17 @@ from math import floor
 from pathlib import Path
 from typing import Any, cast, TypeVar
 
-from fourbar_ros.configuration import check_keys, config_file, load_yaml
+from fourbar_ros.common.config_files import check_keys, config_file, load_yaml
+from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.settings import Parameter
 from fourbar_ros.control import ControllerSettings
 from fourbar_ros.control.parameters import SETTINGS as CONTROLLER
-from fourbar_ros.device.testbed import TIMEOUT_ACTIONS
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.device.supervisor import TIMEOUT_ACTIONS
 from fourbar_ros.estimation import EstimatorSettings
 from fourbar_ros.estimation.parameters import SETTINGS as ESTIMATOR
 from fourbar_ros.mechanism import assemble, LINK_NAMES, load_mechanism, Mechanism
 from fourbar_ros.mechanism.closure import BRANCHES
 from fourbar_ros.mechanism.constants import Array
-from fourbar_ros.parameters import Parameter
 from fourbar_ros.plant import InitialState, load_table, Table
 
 LARGEST_SEED = 2 ** 63 - 1

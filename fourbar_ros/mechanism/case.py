@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 A motion to simulate, described by a file: mechanism, initial state, motor torques, times.
@@ -31,19 +20,19 @@ import json
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.mechanism.closure import branch_of, check_motion, ClosureError
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.forces import NOTHING, Surroundings
-from fourbar_ros.mechanism.layout import (
+from fourbar_ros.mechanism.integration import move_with_cosines
+from fourbar_ros.mechanism.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism, numbers
+from fourbar_ros.mechanism.state import (
     LINK_ANGLES,
     LINK_RATES,
     make_state,
     WHEEL_ANGLES,
     WHEEL_SPEEDS,
 )
-from fourbar_ros.mechanism.motion import move_with_cosines
-from fourbar_ros.mechanism.parameters import FLYWHEEL_NAMES, LINK_NAMES, Mechanism, numbers
 import numpy as np
 
 DEFAULT_STEP = 1e-3

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Loop closure: `l_b e(phi_b) + l_c e(phi_c) = l_a e(phi_a) + l_d e(phi_d)` and its two branches.
@@ -26,10 +15,10 @@ from __future__ import annotations
 from math import acos, atan2, cos, hypot, isfinite, pi, sin
 from operator import itemgetter
 
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.mechanism.angles import wrap
 from fourbar_ros.mechanism.constants import Array
-from fourbar_ros.mechanism.parameters import LINK_NAMES, Mechanism
+from fourbar_ros.mechanism.mechanism import LINK_NAMES, Mechanism
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Joints that give: four free bodies, held together by a spring and a damper in each joint.
@@ -25,7 +14,7 @@ from __future__ import annotations
 
 from math import ceil, cos, sin
 
-from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.constrained import interpolate
 from fourbar_ros.mechanism.forces import (
@@ -34,7 +23,7 @@ from fourbar_ros.mechanism.forces import (
     Surroundings,
     torques_on_links,
 )
-from fourbar_ros.mechanism.layout import (
+from fourbar_ros.mechanism.state import (
     CENTRE_X,
     CENTRE_Y,
     JOINT_LOSS,

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 How well a linkage can be moved over its configurations, for many linkages at once.
@@ -27,11 +16,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import cos, hypot, nan, sin, sqrt
 
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism.closure import BRANCHES, ClosureError
-from fourbar_ros.mechanism.compiled import kernel
 from fourbar_ros.mechanism.constants import Array, Constants, PAIRS
 from fourbar_ros.mechanism.forces import Four
-from fourbar_ros.mechanism.parameters import Mechanism
+from fourbar_ros.mechanism.mechanism import Mechanism
 from fourbar_ros.mechanism.reduced import close_loop, pair_inertias, reduced_terms
 import numpy as np
 from numpy.typing import ArrayLike, NDArray

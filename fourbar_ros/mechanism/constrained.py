@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The constrained form: the equations of motion in all four link angles, for change points.
@@ -25,10 +14,9 @@ from __future__ import annotations
 
 from math import cos, hypot, sin, sqrt
 
-from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.forces import Four, generalized_forces, Surroundings
-from fourbar_ros.mechanism.layout import SPIN, VELOCITY_X, VELOCITY_Y
 from fourbar_ros.mechanism.reduced import (
     move_centre,
     pair_inertias,
@@ -36,6 +24,7 @@ from fourbar_ros.mechanism.reduced import (
     spin,
     turn,
 )
+from fourbar_ros.mechanism.state import SPIN, VELOCITY_X, VELOCITY_Y
 import numpy as np
 
 # Ratio of the singular values of the constraints below which the weaker direction is at a change

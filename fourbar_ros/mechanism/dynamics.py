@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The quantities of Kane dynamics for everyone outside the integrator.
@@ -24,10 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import cos, sin
 
-from fourbar_ros.errors import FourbarError
-from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism.constants import Array, Constants
-from fourbar_ros.mechanism.parameters import Mechanism
+from fourbar_ros.mechanism.mechanism import Mechanism
 from fourbar_ros.mechanism.reduced import gammas, reduced_terms
 import numpy as np
 from numpy.typing import ArrayLike

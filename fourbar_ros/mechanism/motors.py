@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The flywheel motors: what torque they give for what they are asked, and how they follow a speed.
@@ -23,9 +12,9 @@ from __future__ import annotations
 from math import exp, inf, isnan
 from typing import Any
 
-from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism.constants import record
-from fourbar_ros.mechanism.parameters import Mechanism
+from fourbar_ros.mechanism.mechanism import Mechanism
 import numpy as np
 
 # Bandwidth of the loop in the motor's own electronics that follows a commanded speed [rad/s].

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The reduced form, paper eq. 6: the equations of motion in (phi_a, phi_b), closure built in.
@@ -29,10 +18,10 @@ from __future__ import annotations
 
 from math import atan2, cos, pi, sin, sqrt
 
-from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.forces import generalized_forces, Surroundings
-from fourbar_ros.mechanism.layout import (
+from fourbar_ros.mechanism.state import (
     CENTRE_X,
     CENTRE_Y,
     REST_X,

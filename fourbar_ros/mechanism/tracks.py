@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Many motions of the links side by side, each under torques of its own that change every tick."""
 
@@ -18,10 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from fourbar_ros.mechanism.compiled import kernel, prange
+from fourbar_ros.kernels.compiler import kernel, prange
 from fourbar_ros.mechanism.constants import Array
-from fourbar_ros.mechanism.layout import LINK_RATES
-from fourbar_ros.mechanism.motion import move_held
+from fourbar_ros.mechanism.integration import move_held
+from fourbar_ros.mechanism.state import LINK_RATES
 import numpy as np
 from numpy.typing import NDArray
 

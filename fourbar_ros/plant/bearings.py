@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 What the bearings of the wheels take of the torque of their motors.
@@ -20,8 +9,8 @@ Within a step of the plant the torque is constant, at its mean; so impulse and w
 
 from __future__ import annotations
 
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism import Mechanism
-from fourbar_ros.mechanism.compiled import kernel
 from fourbar_ros.mechanism.constants import record
 from fourbar_ros.mechanism.forces import grip
 from fourbar_ros.mechanism.motors import FIELDS as MOTOR_FIELDS

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The edge of the table: where a joint meets it the linkage stops or bounces."""
 
@@ -19,11 +8,11 @@ from __future__ import annotations
 from math import cos, inf, sin
 from typing import Any
 
-from fourbar_ros.mechanism.compiled import kernel
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism.compliant import links_energy_and_spin
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.constrained import dot, rates_of_impulse
-from fourbar_ros.mechanism.layout import CENTRE_X, CENTRE_Y, SPIN, VELOCITY_X, VELOCITY_Y
+from fourbar_ros.mechanism.state import CENTRE_X, CENTRE_Y, SPIN, VELOCITY_X, VELOCITY_Y
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The simulated testbed: linkage, flywheel motors and sensors, advanced in fixed small steps.
@@ -24,11 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import isfinite
 
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.mechanism import assemble, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix, mass_matrix
-from fourbar_ros.mechanism.layout import (
+from fourbar_ros.mechanism.state import (
     CENTRE_POSITION,
     CENTRE_VELOCITY,
     LINK_ANGLES,
@@ -39,14 +28,14 @@ from fourbar_ros.mechanism.layout import (
 )
 from fourbar_ros.plant.bearings import drives_of
 from fourbar_ros.plant.edge import joint_levers, joint_motion
-from fourbar_ros.plant.ledger import balance, CONTACTS, Ledger, nothing_added
-from fourbar_ros.plant.motion import (
+from fourbar_ros.plant.energy_budget import balance, CONTACTS, EnergyBudget, nothing_added
+from fourbar_ros.plant.sensors import LinkSensors
+from fourbar_ros.plant.step import (
     advance_plant,
     Boxed,
     MOTOR_STATE_SIZE,
     SOUND,
 )
-from fourbar_ros.plant.sensors import LinkSensors
 from fourbar_ros.plant.table import quantum, surroundings_of, Table
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -285,7 +274,7 @@ class Plant:
         """How often a joint met the edge of the table since the start or the last reset."""
         return int(self._added[CONTACTS])
 
-    def ledger(self) -> Ledger:
+    def ledger(self) -> EnergyBudget:
         """Draw up the accounts of energy and momentum since the start or the last reset."""
         return balance(self.mechanism, self._state, self._start, self._added)
 

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A replay says what the estimator would have said, and how far that is from what it did say."""
 
@@ -21,7 +10,7 @@ from fourbar_ros.analysis.bags import BagError, read_bag
 from fourbar_ros.analysis.replay import replay, ReplayError
 from fourbar_ros.analysis.replay_comparison import as_json, as_text, compare
 from fourbar_ros.analysis.replay_figure import png
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.loop import load_scenario
 import numpy as np
 import pytest

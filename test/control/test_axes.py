@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Terms of paper eq. 6 on axes that exist at change points too, and what errors ask of them."""
 
@@ -19,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import pi
 
-from fourbar_ros.control.axes import (
+from fourbar_ros.control.branch import Branch, CROSSED, FOLDED, LINKS_ALONE
+from fourbar_ros.control.computed_torque import (
     A00,
     A01,
     A11,
@@ -37,7 +27,6 @@ from fourbar_ros.control.axes import (
     NO_HOLD,
     TERMS,
 )
-from fourbar_ros.control.branch import Branch, CROSSED, FOLDED, LINKS_ALONE
 from fourbar_ros.mechanism import (
     assemble,
     kinetic_energy,

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the controller does before, while and after it may drive."""
 
@@ -27,11 +16,11 @@ from fourbar_ros.control import (
     Point,
     SetpointError,
 )
-from fourbar_ros.control.accounts import COPPER, EQ9, FLYWHEEL_ENERGY, WORK
+from fourbar_ros.control.actuation_cost import COPPER, EQ9, FLYWHEEL_ENERGY, WORK
 from fourbar_ros.control.allocation import AllocationError
 from fourbar_ros.control.controller import LOST_IN_A_ROW, NO_HOLD
-from fourbar_ros.control.guide import STOPPING_TIME
-from fourbar_ros.control.law import SHARED_OUT
+from fourbar_ros.control.reference_generator import STOPPING_TIME
+from fourbar_ros.control.tracking_law import SHARED_OUT
 from fourbar_ros.mechanism import assemble, kinetic_energy, Mechanism
 from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.plant import InitialState
@@ -281,7 +270,7 @@ def test_at_a_change_point_of_the_parallelogram_it_holds(
     # Three seconds are more than ten time constants of the law.
     assert np.abs(wrap_angles(truth.link_angles - np.array([0.1, 0.1 + theta] * 2))).max() < 1e-4
     assert np.abs(truth.link_rates).max() < 1e-4
-    assert not steered.controller.wheels.findings()
+    assert not steered.controller.wheels.faults()
 
 
 # Accounts
@@ -471,7 +460,7 @@ def test_any_mode_follows_any_other_without_a_blow(
     settle(steered, 5.0)
     assert steered.controller.mode == 'hold'
     assert np.abs(rates_of(steered)).max() < 1e-3
-    assert not steered.controller.wheels.findings()
+    assert not steered.controller.wheels.faults()
     assert steered.controller.problem == ''
 
 
@@ -574,7 +563,7 @@ def test_command_can_be_changed_on_the_way(moving: Any) -> None:
         assert controller.mode == 'track'
     # Without a change it is below 2e-3 rad: a motor's lag and a tick late.
     assert np.abs(errors).max() < 4e-3
-    assert not controller.wheels.findings()
+    assert not controller.wheels.faults()
 
 
 # Gains and rates

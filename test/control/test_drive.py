@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Commands make wheels gain the momentum that is asked for, whatever their bearings take."""
 
@@ -19,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from fourbar_ros.control import ControllerSettings, WheelCommand
-from fourbar_ros.control.drive import by_name, REACH, UNSURE, WheelDrive
+from fourbar_ros.control.wheel_command import by_name, REACH, UNSURE, WheelCommander
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.motors import SPEED_BANDWIDTH
 from fourbar_ros.plant import InitialState, Plant, Table
@@ -49,7 +38,7 @@ def momenta(mechanism: Mechanism, plant: Plant) -> Array:
     return mechanism.flywheel_inertias * (truth.wheel_speeds + truth.link_rates)
 
 
-def drive_for(plant: Plant, drive: WheelDrive, torques: Array, seconds: float, by_speed: bool,
+def drive_for(plant: Plant, drive: WheelCommander, torques: Array, seconds: float, by_speed: bool,
               settings: ControllerSettings) -> list[WheelCommand]:
     """Command torques that shall act, as the controller does, telling it how links accelerate."""
     commands, rates = [], plant.truth().link_rates
@@ -72,7 +61,7 @@ def test_commanded_speeds_make_wheels_gain_the_momentum_asked_for(
     bearings: WheelBearings, prototype: Mechanism,
 ) -> None:
     """From standstill: what the bearings take, the motors' own loop gives besides."""
-    plant, drive = plant_with(prototype, bearings), WheelDrive(prototype)
+    plant, drive = plant_with(prototype, bearings), WheelCommander(prototype)
     drive.begin(np.zeros(4))
     drive_for(plant, drive, TORQUES, 2.0, True, ControllerSettings())
     gained = momenta(prototype, plant)
@@ -86,7 +75,7 @@ def test_commanded_torques_have_the_friction_added(prototype: Mechanism) -> None
     bearings = replace(RUBBING, static_ratio=1.0)
     known = ControllerSettings(bearing_coulomb=bearings.coulomb, bearing_viscous=bearings.viscous)
     for settings, gained_share in ((known, 1.0), (ControllerSettings(), 0.5)):
-        plant, drive = plant_with(prototype, bearings), WheelDrive(prototype)
+        plant, drive = plant_with(prototype, bearings), WheelCommander(prototype)
         plant.advance(1000, 2.0 * TORQUES + np.copysign(2e-3, TORQUES))
         assert np.abs(plant.truth().wheel_speeds).min() > 10.0 * UNSURE
         # Until the motors give what they are told and no longer what they were.
@@ -103,7 +92,7 @@ def test_commanded_torques_have_the_friction_added(prototype: Mechanism) -> None
 
 
 def test_friction_is_known_by_sign_from_a_little_speed_on(prototype: Mechanism) -> None:
-    drive = WheelDrive(prototype)
+    drive = WheelCommander(prototype)
     settings = ControllerSettings(bearing_coulomb=1e-3, bearing_viscous=2e-6)
     speeds = np.array([0.0, 0.25 * UNSURE, -UNSURE, 100.0])
     np.testing.assert_allclose(
@@ -118,7 +107,7 @@ def test_friction_is_known_by_sign_from_a_little_speed_on(prototype: Mechanism) 
 
 
 def test_motors_are_not_asked_for_more_than_their_limit(prototype: Mechanism) -> None:
-    drive = WheelDrive(prototype)
+    drive = WheelCommander(prototype)
     drive.look(np.full(4, 100.0), ControllerSettings(bearing_coulomb=1e-3))
     command = drive.command(np.array([0.05, -0.05, 0.02, 0.0]), NONE, NONE, ALL, PERIOD, False)
     np.testing.assert_allclose(command.values, [0.05, -0.049, 0.021, 0.001])
@@ -127,7 +116,7 @@ def test_motors_are_not_asked_for_more_than_their_limit(prototype: Mechanism) ->
 @pytest.mark.parametrize('speed', [0.0, 120.0, -40.0])
 def test_speeds_start_where_the_wheels_are(speed: float, prototype: Mechanism) -> None:
     """No torque asked for, none given, however fast they turn: bumpless."""
-    plant, drive = plant_with(prototype, WheelBearings()), WheelDrive(prototype)
+    plant, drive = plant_with(prototype, WheelBearings()), WheelCommander(prototype)
     plant.advance(1000, np.full(4, speed), True)
     # More than 30 time constants of the motors.
     plant.advance(200, np.zeros(4))
@@ -142,7 +131,7 @@ def test_speeds_start_where_the_wheels_are(speed: float, prototype: Mechanism) -
 
 def test_change_from_torques_to_speeds_goes_on_from_what_is_measured(prototype: Mechanism
                                                                      ) -> None:
-    drive = WheelDrive(prototype)
+    drive = WheelCommander(prototype)
     drive.begin(np.full(4, 500.0))
     speeds = np.array([10.0, -20.0, 30.0, 0.0])
     drive.command(NONE, NONE, speeds, ALL, PERIOD, False)
@@ -152,7 +141,7 @@ def test_change_from_torques_to_speeds_goes_on_from_what_is_measured(prototype: 
 
 def test_speeds_run_ahead_no_further_than_the_motor_can_follow(prototype: Mechanism) -> None:
     """A wheel that does not follow is asked for most of its torque, and winds nothing up."""
-    drive, speeds = WheelDrive(prototype), np.full(4, 20.0)
+    drive, speeds = WheelCommander(prototype), np.full(4, 20.0)
     drive.begin(speeds)
     for _ in range(1000):
         command = drive.command(TORQUES, NONE, speeds, ALL, PERIOD, True)
@@ -165,7 +154,7 @@ def test_speeds_run_ahead_no_further_than_the_motor_can_follow(prototype: Mechan
 
 def test_links_that_accelerate_take_their_wheels_along(prototype: Mechanism) -> None:
     """A wheel without torque keeps its absolute speed: relative to its link it falls behind."""
-    drive, acceleration = WheelDrive(prototype), np.array([1.0, -2.0, 0.5, 0.0])
+    drive, acceleration = WheelCommander(prototype), np.array([1.0, -2.0, 0.5, 0.0])
     drive.begin(NONE)
     for _ in range(5):
         command = drive.command(NONE, acceleration, NONE, ALL, PERIOD, True)
@@ -175,7 +164,7 @@ def test_links_that_accelerate_take_their_wheels_along(prototype: Mechanism) -> 
 # Without power
 
 def test_wheel_without_power_is_not_named_and_wound_up(prototype: Mechanism) -> None:
-    drive, powered = WheelDrive(prototype), np.array([True, False, True, True])
+    drive, powered = WheelCommander(prototype), np.array([True, False, True, True])
     drive.begin(NONE)
     for speed in (10.0, 8.0, 6.0):
         command = drive.command(TORQUES, NONE, np.full(4, speed), powered, PERIOD, True)

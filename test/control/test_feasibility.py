@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What a motion needs of the wheels is what the plant takes, and limits are told with numbers."""
 
@@ -29,8 +18,8 @@ from fourbar_ros.control.feasibility import (
     wheel_loads,
     Wheels,
 )
-from fourbar_ros.control.reference import SoftStep, Way
 from fourbar_ros.control.setpoint import angles_along, SetpointError
+from fourbar_ros.control.soft_step import SoftStep, TrajectorySegment
 from fourbar_ros.control.trajectory import Point, read_trajectory
 from fourbar_ros.mechanism import (
     angular_momentum,
@@ -89,11 +78,11 @@ def quarter_turn(duration: float) -> SoftStep:
     return step(0.0, pi / 3, pi / 2, pi / 2, duration)
 
 
-def present_at(mechanism: Mechanism, way: Way) -> Array:
+def present_at(mechanism: Mechanism, way: TrajectorySegment) -> Array:
     return assemble(mechanism, *way.at(0.0)[0])
 
 
-def loads(mechanism: Mechanism, way: Way, wheels: Wheels, times: Array
+def loads(mechanism: Mechanism, way: TrajectorySegment, wheels: Wheels, times: Array
           ) -> tuple[Array, Array, Array]:
     """Return link angles, torques and speeds along a way."""
     motion = way.sample(times)
@@ -227,7 +216,7 @@ def test_wheels_of_one_pair_can_turn_this_pair_only(paper: Mechanism) -> None:
 
 # Limits
 
-def refusal(mechanism: Mechanism, way: Way, wheels: Wheels) -> str:
+def refusal(mechanism: Mechanism, way: TrajectorySegment, wheels: Wheels) -> str:
     with pytest.raises(SetpointError) as caught:
         check_needs(mechanism, way, present_at(mechanism, way), wheels)
     assert '\n' not in str(caught.value)

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The reference goes on without a jump, and comes to rest before a change point."""
 
@@ -18,9 +7,9 @@ from __future__ import annotations
 
 from math import pi, sin
 
-from fourbar_ros.control.guide import Guide, STOPPING_TIME
-from fourbar_ros.control.reference import SoftStep
+from fourbar_ros.control.reference_generator import ReferenceGenerator, STOPPING_TIME
 from fourbar_ros.control.setpoint import CHANGE_POINT_MARGIN, follow
+from fourbar_ros.control.soft_step import SoftStep
 from fourbar_ros.mechanism import assemble, closure_error, Mechanism, reduced_form
 import numpy as np
 from numpy.typing import NDArray
@@ -36,9 +25,9 @@ each_seed = pytest.mark.parametrize('seed', SEEDS)
 
 
 def moving_guide(mechanism: Mechanism, angles: Array, travel: Array, duration: float,
-                 seconds: float) -> tuple[Guide, int]:
+                 seconds: float) -> tuple[ReferenceGenerator, int]:
     """Return a guide after some time of a move, and the stamp."""
-    guide = Guide(mechanism)
+    guide = ReferenceGenerator(mechanism)
     guide.begin(angles)
     step = SoftStep(guide.motion.copy(), guide.motion[0] + travel, duration)
     guide.go(step, follow(mechanism, step, guide.angles, crossing=guide.paired)[-1], 10 ** 9)
@@ -49,7 +38,7 @@ def moving_guide(mechanism: Mechanism, angles: Array, travel: Array, duration: f
     return guide, now
 
 
-def run(guide: Guide, now: int, seconds: float) -> tuple[Array, Array, Array]:
+def run(guide: ReferenceGenerator, now: int, seconds: float) -> tuple[Array, Array, Array]:
     """Go on, and return angles, rates and accelerations (n, 4), the present first."""
     found = [(guide.angles.copy(), guide.rates.copy(), guide.accelerations.copy())]
     for _ in range(round(seconds / PERIOD)):
@@ -71,7 +60,7 @@ def check_continuous(angles: Array, rates: Array, jerk: float) -> None:
 # Where it begins
 
 def test_it_stands_where_the_links_are(uneven: Mechanism) -> None:
-    guide, angles = Guide(uneven), assemble(uneven, 0.3, 1.5)
+    guide, angles = ReferenceGenerator(uneven), assemble(uneven, 0.3, 1.5)
     guide.begin(angles)
     np.testing.assert_array_equal(guide.angles, angles)
     np.testing.assert_array_equal(guide.destination, angles)
@@ -88,7 +77,7 @@ def test_pairs_are_parallel_on_whatever_turns_they_are(
     theta: float, turns_c: int, turns_d: int, paper: Mechanism,
 ) -> None:
     """It is nearest to what it was given, and not a jump by turns."""
-    guide = Guide(paper)
+    guide = ReferenceGenerator(paper)
     off = np.array([1e-3, -2e-3, -1e-3, 4e-3])
     turns = 2.0 * pi * np.array([0, 0, turns_c, turns_d])
     measured = 0.4 + np.array([0.0, theta, 0.0, theta]) + off + turns
@@ -151,7 +140,7 @@ def test_halt_comes_to_rest_soon_without_a_jump(
 
 
 def test_halt_at_rest_changes_nothing(paper: Mechanism) -> None:
-    guide = Guide(paper)
+    guide = ReferenceGenerator(paper)
     guide.begin(assemble(paper, 0.3, 1.5))
     before = guide.angles.copy()
     guide.halt(10 ** 9)
@@ -163,7 +152,7 @@ def test_halt_at_rest_changes_nothing(paper: Mechanism) -> None:
 def test_moving_links_are_taken_over(seed: int, uneven: Mechanism) -> None:
     """The reference begins with the rates that they have, and stops within its time."""
     rng = np.random.default_rng(seed)
-    guide, angles = Guide(uneven), assemble(uneven, 0.3, 1.5)
+    guide, angles = ReferenceGenerator(uneven), assemble(uneven, 0.3, 1.5)
     rates = np.zeros(4)
     rates[:2] = rng.uniform(-0.3, 0.3, 2)
     rates[2:] = reduced_form(uneven, angles, rates).gamma @ rates[:2]
@@ -204,7 +193,7 @@ def test_it_comes_to_rest_before_a_change_point(
     sine: float, rate: float, at_once: bool, folding: Mechanism,
 ) -> None:
     """In less time the nearer that is; at once if there is no time."""
-    guide, angles = Guide(folding), near_change_point(folding, sine)
+    guide, angles = ReferenceGenerator(folding), near_change_point(folding, sine)
     assert abs(sin(angles[3] - angles[2])) == pytest.approx(sine, rel=1e-9)
     rates = np.array([0.0, rate, 0.0, 0.0])
     rates[2:] = reduced_form(folding, angles, rates).gamma @ rates[:2]
@@ -218,7 +207,7 @@ def test_it_comes_to_rest_before_a_change_point(
 
 
 def test_on_the_parallelogram_a_change_point_is_no_obstacle(paper: Mechanism) -> None:
-    guide = Guide(paper)
+    guide = ReferenceGenerator(paper)
     rates = np.tile([0.0, 0.3], 2)
     guide.move_from(np.array([0.2, 0.15, 0.2, 0.15]), rates, 10 ** 9)
     reached, _, _ = run(guide, 10 ** 9, STOPPING_TIME)

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Torques of the law, in the equations of motion of all four links."""
 
@@ -22,10 +11,10 @@ from math import pi
 
 from fourbar_ros.control import ControllerSettings
 from fourbar_ros.control.allocation import AllocationError, ALLOCATIONS
-from fourbar_ros.control.axes import BRANCH_A, BRANCH_B, HOLD, NO_HOLD
 from fourbar_ros.control.branch import Branch, BRANCHES, PARALLELOGRAM
-from fourbar_ros.control.guide import Guide
-from fourbar_ros.control.law import (
+from fourbar_ros.control.computed_torque import BRANCH_A, BRANCH_B, HOLD, NO_HOLD
+from fourbar_ros.control.reference_generator import ReferenceGenerator
+from fourbar_ros.control.tracking_law import (
     Decision,
     HORIZON,
     motor_bounds,
@@ -54,9 +43,10 @@ def without_limits(mechanism: Mechanism) -> Mechanism:
         motor_voltages=np.full(4, np.inf))
 
 
-def guide_at(mechanism: Mechanism, angles: Array, rates: Array, accelerations: Array) -> Guide:
+def guide_at(mechanism: Mechanism, angles: Array, rates: Array, accelerations: Array
+             ) -> ReferenceGenerator:
     """Make a reference that is on a move."""
-    guide = Guide(mechanism)
+    guide = ReferenceGenerator(mechanism)
     guide.begin(angles)
     guide.angles[:] = angles
     guide.rates[:], guide.accelerations[:] = rates, accelerations
@@ -76,7 +66,7 @@ def law_of(mechanism: Mechanism, usable: NDArray[np.bool_] = ALL, **settings: fl
     return law
 
 
-def decide(law: TrackingLaw, guide: Guide, angles: Array, rates: Array,
+def decide(law: TrackingLaw, guide: ReferenceGenerator, angles: Array, rates: Array,
            disturbance: Array = QUIET, speeds: Array = NONE, friction: Array = NONE,
            sticking: float = 0.0) -> Decision:
     return law.decide(guide, angles, rates, disturbance, speeds, friction, sticking)

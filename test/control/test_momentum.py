@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Drift of the wheels, and when it takes the last of their momentum."""
 
@@ -21,7 +10,13 @@ from dataclasses import replace
 from math import exp, inf
 from typing import Any
 
-from fourbar_ros.control.momentum import LEAST_MARGIN, LEAST_TIME, MEMORY, MomentumWatch, STEADY
+from fourbar_ros.control.momentum_margin import (
+    LEAST_MARGIN,
+    LEAST_TIME,
+    MEMORY,
+    MomentumMonitor,
+    STEADY,
+)
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.plant import InitialState
 import numpy as np
@@ -36,9 +31,9 @@ NONE = np.zeros(4)
 
 def watched(mechanism: Mechanism, seconds: float, acceleration: Array, start: Array = NONE,
             planned: Array = NONE, links: Array = NONE, period: float = PERIOD
-            ) -> tuple[MomentumWatch, Array]:
+            ) -> tuple[MomentumMonitor, Array]:
     """Let wheels drift at constant accelerations, beside what is planned; return last speeds."""
-    watch = MomentumWatch(mechanism)
+    watch = MomentumMonitor(mechanism)
     watch.begin(start)
     rate = acceleration + planned / mechanism.flywheel_inertias - links
     for n in range(round(seconds / period)):
@@ -113,7 +108,7 @@ def test_tick_without_a_period_teaches_nothing(prototype: Mechanism) -> None:
 # Warnings
 
 def test_warned_is_of_the_wheel_with_the_least_margin(prototype: Mechanism) -> None:
-    watch = MomentumWatch(prototype)
+    watch = MomentumMonitor(prototype)
     speeds = np.array([10.0, -(1.0 - LEAST_MARGIN) * 300.0 - 1.0, 200.0, 0.0])
     assert watch.warning(speeds) == (
         'flywheel_b turns at 256 rad/s of 300 rad/s: momentum is not lost, turn back')

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The table of parameters and the settings are the same thing."""
 
@@ -18,11 +7,11 @@ from __future__ import annotations
 
 from dataclasses import fields
 
+from fourbar_ros.common.settings import Parameter
 from fourbar_ros.control import Controller, ControllerSettings
 from fourbar_ros.control.parameters import PARAMETERS, SETTINGS
 from fourbar_ros.control.settings import WHEEL_TARGETS
 from fourbar_ros.mechanism import Mechanism
-from fourbar_ros.parameters import Parameter
 import pytest
 
 each_row = pytest.mark.parametrize('row', SETTINGS, ids=[row.name for row in SETTINGS])

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A setpoint means what it names, or is refused with the name or number that speaks against it."""
 
@@ -21,13 +10,13 @@ from typing import Any
 
 from fourbar_ros.control import SetpointError
 from fourbar_ros.control.branch import on_parallelogram
-from fourbar_ros.control.reference import SoftStep
 from fourbar_ros.control.setpoint import (
     CHANGE_POINT_MARGIN,
     check_names,
     follow,
     plan,
 )
+from fourbar_ros.control.soft_step import SoftStep
 from fourbar_ros.mechanism import (
     assemble,
     closure_error,

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A bench of four wheels without a linkage, whose every torque is on record."""
 
@@ -18,19 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.device import (
     ArmingGate,
     Device,
+    DeviceFault,
     DeviceState,
+    DeviceSupervisor,
     Drive,
-    Finding,
     Samples,
-    Testbed,
-    TestbedSettings,
+    SupervisorSettings,
     Timing,
     WheelSample,
 )
-from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import LINK_NAMES, load_mechanism, Mechanism
 from fourbar_ros.plant import SensorReading
 import numpy as np
@@ -72,7 +61,7 @@ class Bench(Device):
         self.complete = True
         self.told: list[Drive] = []
         self.gates: list[DeviceState] = []
-        self.found: list[Finding] = []
+        self.found: list[DeviceFault] = []
         self.in_the_way: list[str] = []
         self.held: list[str] = []
         self.releases = 0
@@ -96,11 +85,11 @@ class Bench(Device):
         self.releases += 1
         return self.held
 
-    def findings(self) -> Sequence[Finding]:
+    def faults(self) -> Sequence[DeviceFault]:
         """Find what it was made to."""
         return self.found
 
-    def obstacles(self) -> Sequence[str]:
+    def arming_blockers(self) -> Sequence[str]:
         """Be in the way if it was made to."""
         return self.in_the_way
 
@@ -129,31 +118,31 @@ class Bench(Device):
 class Operated:
     """A testbed around the bench, with both clocks in one hand."""
 
-    def __init__(self, mechanism: Mechanism, settings: TestbedSettings) -> None:
+    def __init__(self, mechanism: Mechanism, settings: SupervisorSettings) -> None:
         self.bench = Bench(mechanism)
-        self.testbed = Testbed(self.bench, settings)
+        self.testbed = DeviceSupervisor(self.bench, settings)
         self.bench.gate = self.testbed.gate
         self.stamp_ns = 1_000_000_000
-        self.steady_ns = 50_000_000_000
+        self.monotonic_ns = 50_000_000_000
 
     def tick(self, periods: float = 1.0, steady: float | None = None
              ) -> tuple[Samples, Timing]:
         """Let stamps advance by some periods, the steady clock by as many unless told."""
         self.stamp_ns += round(periods * PERIOD_NS)
-        self.steady_ns += round((periods if steady is None else steady) * PERIOD_NS)
-        result = self.testbed.tick(self.stamp_ns, self.steady_ns)
-        self.testbed.published(self.steady_ns, 1000)
+        self.monotonic_ns += round((periods if steady is None else steady) * PERIOD_NS)
+        result = self.testbed.tick(self.stamp_ns, self.monotonic_ns)
+        self.testbed.published(self.monotonic_ns, 1000)
         return result
 
     def command(self, *efforts: float, ahead_ns: int = 0, names: list[str] | None = None) -> None:
         """Command the wheels a, b, ..., as many as there are efforts."""
         wheels = [f'flywheel_{letter}' for letter in 'abcd'[:len(efforts)]]
         self.testbed.command(
-            self.stamp_ns + ahead_ns, names or wheels, [], [], list(efforts), self.steady_ns)
+            self.stamp_ns + ahead_ns, names or wheels, [], [], list(efforts), self.monotonic_ns)
 
-    def arm(self, *obstacles: str) -> tuple[bool, str]:
+    def arm(self, *arming_blockers: str) -> tuple[bool, str]:
         """Ask to drive."""
-        return self.testbed.arm(self.steady_ns, obstacles)
+        return self.testbed.arm(self.monotonic_ns, arming_blockers)
 
     @property
     def driven(self) -> list[float]:
@@ -177,7 +166,7 @@ def paper() -> Mechanism:
 def operate(paper: Mechanism) -> Callable[..., Operated]:
     """Return a function that makes a testbed, armed after its first tick unless told."""
     def make(armed: bool = True, **settings: object) -> Operated:
-        operated = Operated(paper, TestbedSettings(**settings))  # type: ignore[arg-type]
+        operated = Operated(paper, SupervisorSettings(**settings))  # type: ignore[arg-type]
         if armed:
             operated.tick()
             assert operated.arm() == (True, 'armed')

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The arming gate, every state against every event."""
 
@@ -18,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fourbar_ros.device import DeviceState
-from fourbar_ros.device.gate import ArmingGate
+from fourbar_ros.device.arming import ArmingGate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
@@ -88,8 +77,9 @@ def test_new_gate_is_disarmed() -> None:
     (STOPPED, [], ['emergency_stop', 'old reason', 'reset_emergency_stop']),
     (FAULT, [], ['fault', 'old reason', 'reset_emergency_stop']),
 ])
-def test_refusal_says_why(state: DeviceState, obstacles: list[str], needles: list[str]) -> None:
-    armed, message = gate_in(state).arm(NOW, obstacles)
+def test_refusal_says_why(
+        state: DeviceState, arming_blockers: list[str], needles: list[str]) -> None:
+    armed, message = gate_in(state).arm(NOW, arming_blockers)
     assert not armed
     for needle in needles:
         assert needle in message

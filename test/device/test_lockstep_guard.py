@@ -1,31 +1,20 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What helps a tick without an answer: nothing, sending it again, or going on."""
 
-from fourbar_ros.device import Attendance, LockstepGuard, LockstepPace, Remedy
+from fourbar_ros.device import LockstepClock, LockstepGuard, Participants, Recovery
 
 PERIOD = 4_000_000
 TIMEOUT = 1_000_000_000
 SETTLE = 500_000_000
 FIRST = 1_000_000_000
-ALL = Attendance(1, 1, 1, 1, 1)
+ALL = Participants(1, 1, 1, 1, 1)
 
 
-def waiting() -> tuple[LockstepPace, LockstepGuard, int]:
+def waiting() -> tuple[LockstepClock, LockstepGuard, int]:
     """Return a lock-step whose first tick just went out to all, its guard and the time."""
-    pace = LockstepPace(PERIOD)
+    pace = LockstepClock(PERIOD)
     guard = LockstepGuard(pace, TIMEOUT, SETTLE)
     guard.look(ALL, 0)
     guard.look(ALL, SETTLE)
@@ -37,7 +26,7 @@ def test_tick_is_sent_again_after_the_timeout_at_intervals_that_grow() -> None:
     _, guard, start = waiting()
     step = TIMEOUT // 20
     times = [n * step for n in range(20 * 60)
-             if guard.remedy(None, start + n * step) is not Remedy.NOTHING]
+             if guard.remedy(None, start + n * step) is not Recovery.NOTHING]
     intervals = [after - before for before, after in zip([0, *times], times)]
     assert times[0] == TIMEOUT + step
     assert intervals == sorted(intervals)
@@ -47,8 +36,8 @@ def test_tick_is_sent_again_after_the_timeout_at_intervals_that_grow() -> None:
 
 
 def test_link_angles_go_out_again_only_if_the_estimator_said_nothing() -> None:
-    for estimate, remedy in ((None, Remedy.SEND_ALL), (FIRST - PERIOD, Remedy.SEND_ALL),
-                             (FIRST, Remedy.SEND_TICK)):
+    for estimate, remedy in ((None, Recovery.SEND_ALL), (FIRST - PERIOD, Recovery.SEND_ALL),
+                             (FIRST, Recovery.SEND_TICK)):
         _, guard, start = waiting()
         assert guard.remedy(estimate, start + TIMEOUT + 1) is remedy
 
@@ -56,29 +45,29 @@ def test_link_angles_go_out_again_only_if_the_estimator_said_nothing() -> None:
 def test_answered_tick_needs_no_help() -> None:
     pace, guard, start = waiting()
     assert pace.answered(FIRST)
-    assert guard.remedy(FIRST, start + 100 * TIMEOUT) is Remedy.NOTHING
+    assert guard.remedy(FIRST, start + 100 * TIMEOUT) is Recovery.NOTHING
 
 
 def test_every_tick_has_its_own_patience() -> None:
     pace, guard, now = waiting()
     for _ in range(3):
-        assert guard.remedy(None, now + TIMEOUT) is Remedy.NOTHING
+        assert guard.remedy(None, now + TIMEOUT) is Recovery.NOTHING
         now += TIMEOUT + 1
-        assert guard.remedy(None, now) is Remedy.SEND_ALL
+        assert guard.remedy(None, now) is Recovery.SEND_ALL
         assert pace.answered(pace.now_ns(now))
         assert pace.due(now) is not None
 
 
 def test_nothing_is_sent_to_nobody() -> None:
     _, guard, start = waiting()
-    guard.look(Attendance(1, 1, 0, 1, 0), start + 1)
-    assert guard.remedy(None, start + 5 * TIMEOUT) is Remedy.NOTHING
+    guard.look(Participants(1, 1, 0, 1, 0), start + 1)
+    assert guard.remedy(None, start + 5 * TIMEOUT) is Recovery.NOTHING
 
 
 def test_tick_that_went_out_before_somebody_joined_is_given_up() -> None:
     _, guard, start = waiting()
-    guard.look(Attendance(1, 1, 0, 1, 0), start + 1)
+    guard.look(Participants(1, 1, 0, 1, 0), start + 1)
     guard.look(ALL, start + 2 * TIMEOUT)
     remedies = [guard.remedy(None, start + 2 * TIMEOUT + n * SETTLE // 4) for n in range(12)]
-    assert set(remedies[:4]) == {Remedy.NOTHING}
-    assert remedies[4] is Remedy.GIVE_UP
+    assert set(remedies[:4]) == {Recovery.NOTHING}
+    assert remedies[4] is Recovery.GIVE_UP

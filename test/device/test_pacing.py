@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """By every clock each tick comes once, on the grid, and time never goes back."""
 
@@ -19,13 +8,13 @@ from math import inf, nan
 
 from fourbar_ros.device import (
     ClockLimit,
-    FastPace,
-    LockstepPace,
-    Pace,
-    PaceError,
-    RealtimePace,
+    ClockMode,
+    ClockModeError,
+    FastClock,
+    LockstepClock,
+    RealtimeClock,
 )
-from fourbar_ros.device.pacing import FIRST_STAMP_NS
+from fourbar_ros.device.clock_modes import FIRST_STAMP_NS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
@@ -36,16 +25,16 @@ PERIOD = 4_000_000
 PATIENCE = 100_000_000
 
 
-def pace(period: int = PERIOD, patience: int = PATIENCE) -> RealtimePace:
-    return RealtimePace(SYSTEM, STEADY, period, patience)
+def pace(period: int = PERIOD, patience: int = PATIENCE) -> RealtimeClock:
+    return RealtimeClock(SYSTEM, STEADY, period, patience)
 
 
-def fast(factor: float) -> FastPace:
-    return FastPace(STEADY, PERIOD, factor, PATIENCE)
+def fast(factor: float) -> FastClock:
+    return FastClock(STEADY, PERIOD, factor, PATIENCE)
 
 
-def lockstep() -> LockstepPace:
-    clock = LockstepPace(PERIOD)
+def lockstep() -> LockstepClock:
+    clock = LockstepClock(PERIOD)
     clock.ready = True
     return clock
 
@@ -55,7 +44,7 @@ CLOCKS = {'realtime': pace, 'fast': lambda: fast(3.7), 'as fast as it can': lamb
 every_clock = pytest.mark.parametrize('make', CLOCKS.values(), ids=list(CLOCKS))
 
 
-def due(clock: Pace, steady: int) -> list[int]:
+def due(clock: ClockMode, steady: int) -> list[int]:
     """Take all ticks that are due, one by one."""
     stamps = []
     while (stamp := clock.due(steady)) is not None:
@@ -119,7 +108,7 @@ def test_grid_is_kept_whatever_the_delays(
 
 
 @every_clock
-def test_pause_freezes_time_whatever_passes(make: Callable[[], Pace]) -> None:
+def test_pause_freezes_time_whatever_passes(make: Callable[[], ClockMode]) -> None:
     clock = make()
     clock.due(STEADY)
     clock.pause(STEADY + PERIOD // 2)
@@ -133,7 +122,7 @@ def test_pause_freezes_time_whatever_passes(make: Callable[[], Pace]) -> None:
 
 
 @every_clock
-def test_ticks_stay_on_the_grid_through_pauses_and_steps(make: Callable[[], Pace]) -> None:
+def test_ticks_stay_on_the_grid_through_pauses_and_steps(make: Callable[[], ClockMode]) -> None:
     """Not one is left out or comes twice, and the time of the watchdogs never goes back."""
     clock, now = make(), STEADY
     stamps, times = [], []
@@ -161,9 +150,9 @@ def test_ticks_stay_on_the_grid_through_pauses_and_steps(make: Callable[[], Pace
 
 
 @every_clock
-def test_running_clock_is_not_stepped(make: Callable[[], Pace]) -> None:
+def test_running_clock_is_not_stepped(make: Callable[[], ClockMode]) -> None:
     clock = make()
-    with pytest.raises(PaceError, match='running, pause it first'):
+    with pytest.raises(ClockModeError, match='running, pause it first'):
         clock.step(STEADY)
     assert clock.due(STEADY) is not None
 
@@ -196,7 +185,7 @@ def test_fastest_time_always_has_a_tick_to_make() -> None:
 
 @pytest.mark.parametrize('factor', [-1.0, inf, nan])
 def test_impossible_factor_is_refused(factor: float) -> None:
-    with pytest.raises(PaceError, match='real-time factor'):
+    with pytest.raises(ClockModeError, match='real-time factor'):
         fast(factor)
 
 
@@ -215,10 +204,10 @@ def test_lockstep_waits_for_the_answer_to_this_tick() -> None:
 
 
 def test_lockstep_makes_no_tick_for_nobody() -> None:
-    clock = LockstepPace(PERIOD)
+    clock = LockstepClock(PERIOD)
     assert clock.due(STEADY) is None
     clock.pause(STEADY)
-    with pytest.raises(PaceError, match='nobody is there'):
+    with pytest.raises(ClockModeError, match='nobody is there'):
         clock.step(STEADY)
 
 
@@ -226,7 +215,7 @@ def test_lockstep_takes_one_step_at_a_time() -> None:
     clock = lockstep()
     clock.pause(STEADY)
     assert clock.step(STEADY) == FIRST_STAMP_NS
-    with pytest.raises(PaceError, match='1.000000000 s is not answered yet'):
+    with pytest.raises(ClockModeError, match='1.000000000 s is not answered yet'):
         clock.step(STEADY)
     assert clock.answered(FIRST_STAMP_NS)
     assert clock.due(STEADY) is None

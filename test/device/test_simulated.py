@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The simulated table as a device: when its sensors speak, and what its faults do."""
 
@@ -310,12 +299,12 @@ def test_wheels_are_named_as_in_the_topics(make: Make) -> None:
 
 def test_what_is_broken_is_told_by_name(make: Make) -> None:
     table = make()
-    assert table.diagnosis() == {}
+    assert table.diagnostics() == {}
     table.break_down('link_b', Fault('link_b', 'wrong', 0.25))
     table.break_down('flywheel_a', Fault('flywheel_a', 'dead'))
-    assert table.diagnosis() == {'faults': 'link_b wrong 0.25, flywheel_a dead'}
+    assert table.diagnostics() == {'faults': 'link_b wrong 0.25, flywheel_a dead'}
     table.break_down('link_b', None)
-    assert table.diagnosis() == {'faults': 'flywheel_a dead'}
+    assert table.diagnostics() == {'faults': 'flywheel_a dead'}
 
 
 def test_tilt_that_throws_the_linkage_off_the_table_is_told(ideal: Mechanism) -> None:
@@ -323,9 +312,9 @@ def test_tilt_that_throws_the_linkage_off_the_table_is_told(ideal: Mechanism) ->
         tilt_x=0.05, size_x=0.7)), InitialState(), 5e-4, np.random.default_rng(0))
     table = SimulatedTable(plant, PERIOD_NS)
     for n in range(400):
-        if 'edge' in table.diagnosis():
+        if 'edge' in table.diagnostics():
             break
         table.step(FIRST_NS + n * PERIOD_NS, Drive(np.zeros(4), NO_SPEED, ALL))
-    assert table.diagnosis()['edge'].startswith('the linkage has met the edge of the table, ')
+    assert table.diagnostics()['edge'].startswith('the linkage has met the edge of the table, ')
     table.reset(InitialState())
-    assert table.diagnosis() == {}
+    assert table.diagnostics() == {}

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Torque reaches the wheels only while armed, within limits, and only as long as commands come."""
 
@@ -20,18 +9,18 @@ from dataclasses import replace
 from math import exp, nan
 from typing import Any
 
+from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.named_values import RejectedError
 from fourbar_ros.device import (
+    DeviceFault,
     DeviceState,
+    DeviceSupervisor,
     Drive,
-    Finding,
     Reaction,
     SimulatedTable,
-    Testbed,
-    TestbedSettings,
+    SupervisorSettings,
 )
-from fourbar_ros.errors import FourbarError
 from fourbar_ros.mechanism import angular_momentum, LINK_NAMES, Mechanism
-from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.plant import Fault, InitialState, Plant, PlantError, Table
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelEncoders
@@ -99,7 +88,7 @@ def test_rejected_command_changes_nothing_but_its_counter(
     bed = operate()
     bed.command(1e-5, 2e-5)
     with pytest.raises(RejectedError) as caught:
-        bed.testbed.command(bed.stamp_ns, *fields, bed.steady_ns)
+        bed.testbed.command(bed.stamp_ns, *fields, bed.monotonic_ns)
     assert caught.value.kind == kind
     assert bed.testbed.rejected == Counter({kind: 1})
     assert bed.testbed.last_rejection == str(caught.value)
@@ -311,7 +300,7 @@ def test_finding_has_its_consequence(
 ) -> None:
     bed = operate()
     bed.command(1e-5)
-    bed.bench.found = [Finding(reaction, 'link_b is hot')]
+    bed.bench.found = [DeviceFault(reaction, 'link_b is hot')]
     bed.tick()
     assert bed.testbed.gate.state is state
     assert (bed.testbed.gate.reason == 'link_b is hot') == (state is not DeviceState.ARMED)
@@ -341,7 +330,7 @@ def test_step_without_all_wheels_is_no_tick_that_anybody_could_answer(operate: O
     _, timing = bed.tick(periods=3.0)
     assert timing.lost == 0
     bed.testbed.command(
-        answered_ns, ['flywheel_a'], [], [], [2e-5], bed.steady_ns)
+        answered_ns, ['flywheel_a'], [], [], [2e-5], bed.monotonic_ns)
 
 
 # Watchdog
@@ -432,7 +421,7 @@ def uneven() -> Mechanism:
         [1e-4] * 4, [500.0] * 4)
 
 
-def left_alone(mechanism: Mechanism, action: str) -> tuple[list[Any], Testbed]:
+def left_alone(mechanism: Mechanism, action: str) -> tuple[list[Any], DeviceSupervisor]:
     """
     Spin up the wheels of a moving linkage, then stop commanding.
 
@@ -440,7 +429,8 @@ def left_alone(mechanism: Mechanism, action: str) -> tuple[list[Any], Testbed]:
     """
     plant = Plant(mechanism, Table(LinkSensorSettings(), WheelEncoders(0)),
                   InitialState(0.3, 1.6, 'open', 1.0, 0.6), 5e-4, np.random.default_rng(0))
-    testbed = Testbed(SimulatedTable(plant, PERIOD_NS), TestbedSettings(timeout_action=action))
+    testbed = DeviceSupervisor(
+        SimulatedTable(plant, PERIOD_NS), SupervisorSettings(timeout_action=action))
     truths = []
     for n in range(320):
         now = (1 + n) * PERIOD_NS
@@ -609,7 +599,7 @@ def test_nothing_is_known_before_the_first_answer(operate: Operate) -> None:
 def test_round_trip_and_age_are_on_the_steady_clock(operate: Operate) -> None:
     bed = operate()
     bed.tick()
-    bed.steady_ns += 700_000
+    bed.monotonic_ns += 700_000
     bed.command(0.0)
     _, timing = bed.tick()
     assert timing.round_trip_s == pytest.approx(0.7e-3, rel=1e-12)
@@ -623,9 +613,9 @@ def test_round_trip_and_age_are_on_the_steady_clock(operate: Operate) -> None:
 def test_only_the_first_answer_counts_as_the_round_trip(operate: Operate) -> None:
     bed = operate()
     bed.tick()
-    bed.steady_ns += 700_000
+    bed.monotonic_ns += 700_000
     bed.command(0.0)
-    bed.steady_ns += 700_000
+    bed.monotonic_ns += 700_000
     bed.command(0.0)
     _, timing = bed.tick()
     assert timing.round_trip_s == pytest.approx(0.7e-3, rel=1e-12)
@@ -642,20 +632,20 @@ def test_ticks_without_an_answer_within_one_period_are_lost(
     bed = operate()
     answers = [(n * PERIOD_NS + delay, n) for n, delay in enumerate([0, *delays])
                if delay is not None]
-    start, first = bed.steady_ns, bed.stamp_ns
+    start, first = bed.monotonic_ns, bed.stamp_ns
     for n in range(len(delays) + 4):
         if n:
-            bed.steady_ns = start + (n - 1) * PERIOD_NS
+            bed.monotonic_ns = start + (n - 1) * PERIOD_NS
             _, timing = bed.tick()
         for due, answered in sorted(answers):
             if n * PERIOD_NS <= due < (n + 1) * PERIOD_NS:
-                bed.steady_ns = start + due
+                bed.monotonic_ns = start + due
                 try:
                     bed.command(0.0, ahead_ns=first + answered * PERIOD_NS - bed.stamp_ns)
                 except RejectedError:
                     # An answer that was overtaken by a newer one, so more than a period late.
                     pass
-        bed.steady_ns = start + n * PERIOD_NS
+        bed.monotonic_ns = start + n * PERIOD_NS
         if n == len(delays) + 3:
             # The ticks after the last delay wait for an answer still: two are overdue.
             late = sum(delay is None or delay > PERIOD_NS for delay in delays)
@@ -704,7 +694,7 @@ def test_what_gives_torque_by_itself_while_disarmed(
                   np.random.default_rng(0))
     table = SimulatedTable(plant, PERIOD_NS)
     table.break_down('flywheel_b', Fault('flywheel_b', kind, 5e-5))
-    testbed = Testbed(table, TestbedSettings())
+    testbed = DeviceSupervisor(table, SupervisorSettings())
     now = 0
 
     def efforts(wheels: str = '') -> list[float]:

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 At change points the filter knows what it does not know, and the sensors tell the branch.
@@ -23,12 +12,12 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from fourbar_ros.estimation import Estimate, Estimator, EstimatorSettings
-from fourbar_ros.estimation.filter import LinkageFilter, Randomness
+from fourbar_ros.estimation.filter import LinkageFilter, ProcessNoise
 from fourbar_ros.mechanism import load_mechanism, Mechanism
 from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.mechanism.forces import NOTHING
-from fourbar_ros.mechanism.layout import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
-from fourbar_ros.mechanism.motion import move_held
+from fourbar_ros.mechanism.integration import move_held
+from fourbar_ros.mechanism.state import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -155,7 +144,7 @@ def test_free_motion_is_known_less_well_where_nothing_constrains_it(mechanism: M
     sigmas = []
     for theta in (0.0, 0.3):
         linkage = LinkageFilter(mechanism, 0.2 + theta * np.array([0.0, 1.0, 0.0, 1.0]), 1e-2,
-                                1e-2, Randomness(1e-5))
+                                1e-2, ProcessNoise(1e-5))
         for _ in range(20):
             linkage.correct((0, 1), linkage.angles[:2], NOISE ** 2)
             linkage.move(PERIOD, np.zeros(4))
@@ -170,7 +159,7 @@ def test_covariance_near_and_away_is_the_same(mechanism: Mechanism) -> None:
     for sine in (0.29, 0.31):
         theta = np.arcsin(sine)
         linkage = LinkageFilter(mechanism, 0.2 + theta * np.array([0.0, 1.0, 0.0, 1.0]), 1e-4,
-                                1e-2, Randomness(1e-4, 1e-4))
+                                1e-2, ProcessNoise(1e-4, 1e-4))
         for _ in range(250):
             linkage.correct((0, 1, 2, 3), linkage.angles, NOISE ** 2)
             linkage.move(PERIOD, np.zeros(4))

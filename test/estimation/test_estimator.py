@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The estimator follows the linkage through everything that topics may do to its inputs."""
 
@@ -22,9 +11,9 @@ from itertools import combinations
 from math import inf, nan, pi
 from typing import Any
 
+from fourbar_ros.common.named_values import RejectedError
 from fourbar_ros.estimation import DECISIONS, Estimate, Estimator, EstimatorSettings
 from fourbar_ros.mechanism import assemble, branch_of, LINK_NAMES, Mechanism
-from fourbar_ros.mechanism.by_name import RejectedError
 from fourbar_ros.plant import Fault, InitialState, Plant, Table
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelEncoders

@@ -1,29 +1,18 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The filter predicts the linkage, and its covariance is that of its errors."""
 
 from dataclasses import dataclass, replace
 
 from filterpy.kalman import ExtendedKalmanFilter
-from fourbar_ros.estimation.filter import GYROS, LinkageFilter, Randomness
-from fourbar_ros.estimation.layout import FREE
+from fourbar_ros.estimation.filter import GYROS, LinkageFilter, ProcessNoise
+from fourbar_ros.estimation.filter_state import FREE
 from fourbar_ros.mechanism import assemble, Mechanism, nearest_assembly, reduced_form
 from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.mechanism.forces import NOTHING
-from fourbar_ros.mechanism.layout import STATE_SIZE
-from fourbar_ros.mechanism.motion import move_held
+from fourbar_ros.mechanism.integration import move_held
+from fourbar_ros.mechanism.state import STATE_SIZE
 from fourbar_ros.plant import InitialState, Plant, Table
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelEncoders
@@ -42,7 +31,7 @@ DISTURBANCE = 1e-6
 START_RATE = 0.05
 RUNS, TICKS = 40, 150
 BOUNDS = 0.95
-QUIET = Randomness(1e-7)
+QUIET = ProcessNoise(1e-7)
 
 
 # The model
@@ -82,7 +71,7 @@ def test_prediction_and_transition_are_those_of_the_linkage(
     angles = assemble(mechanism, 0.4, 1.7, branch)
     torques = np.array([3e-5, -2e-5, 1e-5, 4e-5])
     start = np.array([0.4, 1.7, 2.0, -1.5])
-    linkage = LinkageFilter(mechanism, angles, 1e-6, 1e-4, Randomness(0.0))
+    linkage = LinkageFilter(mechanism, angles, 1e-6, 1e-4, ProcessNoise(0.0))
     set_rates(linkage, mechanism, start[2:])
     linkage.move(duration, torques)
     # One step of order four. Its scale is twice the relative rate of 3.5 rad/s (products of two
@@ -107,7 +96,7 @@ def test_wheel_motion_predicts_the_plant(mechanism: Mechanism) -> None:
     plant = Plant(mechanism, Table(LinkSensorSettings(), WheelEncoders(0)),
                   InitialState(0.3, 1.6, 'open', 1.0, -0.5), 5e-4, np.random.default_rng(0))
     truth = plant.truth()
-    linkage = LinkageFilter(mechanism, truth.link_angles, 1e-6, 1e-4, Randomness(0.0))
+    linkage = LinkageFilter(mechanism, truth.link_angles, 1e-6, 1e-4, ProcessNoise(0.0))
     set_rates(linkage, mechanism, truth.link_rates[:2])
     rng = np.random.default_rng(5)
     for _ in range(50):
@@ -152,7 +141,7 @@ def monte_carlo(mechanism: Mechanism, seed: int) -> Consistency:
     for run in range(RUNS):
         angles = assemble(mechanism, 0.2, 1.5)
         linkage = LinkageFilter(
-            mechanism, angles, NOISE ** 2, START_RATE ** 2, Randomness(DISTURBANCE))
+            mechanism, angles, NOISE ** 2, START_RATE ** 2, ProcessNoise(DISTURBANCE))
         start = linkage.x[FREE] + rng.standard_normal(4) * linkage.sigmas()[FREE]
         state = np.zeros(STATE_SIZE)
         state[:4] = nearest_assembly(mechanism, (0, 1), (start[0], start[1]), angles)
@@ -340,7 +329,7 @@ def test_compiled_steps_are_those_of_filterpy(
     """Predict and correct once, and let filterpy do the same with the same matrices."""
     rng = np.random.default_rng(seed)
     linkage = LinkageFilter(
-        mechanism, assemble(mechanism, 3.0, 4.3), 1e-4, 1e-2, Randomness(1e-5, 1e-5, 1e-3))
+        mechanism, assemble(mechanism, 3.0, 4.3), 1e-4, 1e-2, ProcessNoise(1e-5, 1e-5, 1e-3))
     rows = np.zeros((len(sensors), 10 + sum(sensor >= GYROS for sensor in sensors)))
     # Joints 1 to 4: b to a, c to b, d to c, a to d.
     of_links = np.vstack([np.eye(4), np.roll(np.eye(4), 1, axis=1) - np.eye(4)])

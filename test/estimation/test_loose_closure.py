@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 A linkage whose lengths are not those of its file, and whose joints give, is followed all the same.
@@ -22,14 +11,14 @@ turn apart by about delta / (l theta), by as much as their joints let them.
 from dataclasses import replace
 
 from fourbar_ros.estimation import Estimate, Estimator, EstimatorSettings
-from fourbar_ros.estimation.filter import GYROS, LinkageFilter, Randomness
-from fourbar_ros.estimation.layout import LENGTHS
+from fourbar_ros.estimation.filter import GYROS, LinkageFilter, ProcessNoise
+from fourbar_ros.estimation.filter_state import LENGTHS
 from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism, nearest_assembly
 from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.mechanism.dynamics import gamma_matrix
 from fourbar_ros.mechanism.forces import NOTHING
-from fourbar_ros.mechanism.layout import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
-from fourbar_ros.mechanism.motion import move_held
+from fourbar_ros.mechanism.integration import move_held
+from fourbar_ros.mechanism.state import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -270,7 +259,8 @@ def test_links_swing_as_those_of_the_plant(
     """Where they are after half a second, from knowing all at its begin."""
     linkage = replace(compliant, **changed)
     world = World(missing(linkage, 1e-4, 0.0, 0.0, 0.0), aligned + theta, 0.05, apart=0.05)
-    filtered = LinkageFilter(linkage, world.angles, 1e-8, 1e-8, Randomness(0.0, closure=TOLERANCE))
+    filtered = LinkageFilter(
+        linkage, world.angles, 1e-8, 1e-8, ProcessNoise(0.0, closure=TOLERANCE))
     filtered.x[LENGTHS] -= 1e-4
     filtered.x[4:8] = world.rates
     apart, errors = [], []
@@ -289,7 +279,7 @@ def test_links_swing_as_those_of_the_plant(
 def test_transition_is_that_of_the_prediction(compliant: Mechanism) -> None:
     """Off its equilibrium, along motions and lengths that keep the gap across the line closed."""
     linkage = LinkageFilter(
-        compliant, np.array([0.2, 0.3, 0.2, 0.3]), 1e-6, 1e-4, Randomness(1e-5, 1e-5, 0.0, 3e-4))
+        compliant, np.array([0.2, 0.3, 0.2, 0.3]), 1e-6, 1e-4, ProcessNoise(1e-5, 1e-5, 0.0, 3e-4))
     # Apart by 2 mrad.
     linkage.x[:4] += 1e-3 * np.array([-1.0, -1.0, 1.0, 1.0])
     linkage.correct((0,), linkage.angles[:1], 1.0)
@@ -322,7 +312,7 @@ def test_transition_is_that_of_the_prediction(compliant: Mechanism) -> None:
 def test_links_follow_the_lengths_away_from_change_points(uneven: Mechanism) -> None:
     """By finite differences of the assembly, of the transition and of the covariance."""
     linkage = LinkageFilter(uneven, assemble(uneven, 0.2, 1.5), 1e-12, 1e-12,
-                            Randomness(0.0, closure=1e-4))
+                            ProcessNoise(0.0, closure=1e-4))
     # At rest, so that nothing but the lengths changes.
     linkage.move(PERIOD, np.zeros(4))
     slopes = np.zeros((2, 3))
@@ -342,7 +332,7 @@ def test_links_follow_the_lengths_away_from_change_points(uneven: Mechanism) -> 
 def test_gap_at_the_start_is_the_tolerance(uneven: Mechanism) -> None:
     """What the lengths miss, all around the loop, is as large as the setting says."""
     linkage = LinkageFilter(uneven, assemble(uneven, 0.2, 1.5), 1e-6, 1e-6,
-                            Randomness(0.0, closure=1e-3))
+                            ProcessNoise(0.0, closure=1e-3))
     signed = np.array([[np.cos(angle), np.sin(angle)] for angle in linkage.angles]).T * [
         -1.0, 1.0, 1.0, -1.0]
     covariance = linkage.P[LENGTHS, LENGTHS]
@@ -374,7 +364,7 @@ def test_exact_lengths_are_not_estimated(rigid: Mechanism, compliant: Mechanism)
     for mechanism in (rigid, compliant):
         rng = np.random.default_rng(7)
         linkage = LinkageFilter(mechanism, np.array([0.2, 0.3, 0.2, 0.3]), 1e-4, 1e-2,
-                                Randomness(1e-5, 1e-5))
+                                ProcessNoise(1e-5, 1e-5))
         for _ in range(50):
             linkage.correct((0, 1, 2, 3), linkage.angles + NOISE * rng.standard_normal(4),
                             NOISE ** 2)

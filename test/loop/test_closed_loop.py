@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The closed loop does what the whole suite is for."""
 
@@ -18,8 +7,8 @@ from collections.abc import Callable
 from math import pi
 
 from fourbar_ros.control import Controller, ControllerSettings
-from fourbar_ros.control.accounts import FLYWHEEL_ENERGY
-from fourbar_ros.device import DeviceState, SimulatedTable, Testbed, TestbedSettings
+from fourbar_ros.control.actuation_cost import FLYWHEEL_ENERGY
+from fourbar_ros.device import DeviceState, DeviceSupervisor, SimulatedTable, SupervisorSettings
 from fourbar_ros.estimation import Estimator, EstimatorSettings
 from fourbar_ros.loop import ClosedLoop, Step
 from fourbar_ros.mechanism import angular_momentum, branch_of, load_mechanism, Mechanism
@@ -55,7 +44,7 @@ def make_loop() -> MakeLoop:
         plant = Plant(linkage, load_table('ideal'), InitialState(0.0, phi_b, branch), 5e-4,
                       np.random.default_rng(seed))
         loop = ClosedLoop(
-            Testbed(SimulatedTable(plant, PERIOD_NS), TestbedSettings()),
+            DeviceSupervisor(SimulatedTable(plant, PERIOD_NS), SupervisorSettings()),
             Estimator(linkage, EstimatorSettings()), Controller(linkage, ControllerSettings()))
         if settled:
             for _ in range(100):

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Ticks get lost between device and controller, which must not take that for a broken wheel."""
 
@@ -18,14 +7,14 @@ from collections import deque
 from contextlib import suppress
 from dataclasses import replace
 
+from fourbar_ros.common.named_values import RejectedError
 from fourbar_ros.control import SetpointError
-from fourbar_ros.control.drive import by_name
+from fourbar_ros.control.wheel_command import by_name
 from fourbar_ros.device import Samples
-from fourbar_ros.device.pacing import FIRST_STAMP_NS
+from fourbar_ros.device.clock_modes import FIRST_STAMP_NS
 from fourbar_ros.loop.closed_loop import ClosedLoop
 from fourbar_ros.loop.run import make_loop
 from fourbar_ros.loop.scenario import load_scenario
-from fourbar_ros.mechanism.by_name import RejectedError
 import numpy as np
 import pytest
 
@@ -103,4 +92,4 @@ def test_healthy_wheels_stay_healthy(
         scenario = replace(scenario, seed=seed)
         loop = make_loop(replace(scenario, controller=controller))
         run(loop, seed, 4.0, loss, longest, device)
-        assert not loop.controller.wheels.findings(), f'seed {seed}'
+        assert not loop.controller.wheels.faults(), f'seed {seed}'

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Scenario files: what they mean, and that whatever is wrong with them is told by its name."""
 
@@ -21,13 +10,13 @@ from math import inf, nan, pi
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.configuration import ConfigurationError, presets, share_directory
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.common.config_files import ConfigurationError, presets, share_directory
+from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.loop import load_scenario, Scenario, ScenarioError
 from fourbar_ros.loop.description import describe, load_description
 from fourbar_ros.loop.scenario import ALLOWED, scenario_from
 from fourbar_ros.mechanism import assemble
-from fourbar_ros.nodes.tables import TABLES
+from fourbar_ros.ros.tables import TABLES
 import numpy as np
 import pytest
 import yaml

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The way past change points: ideal linkages pass, all others fold, as other engines find too."""
 
 from collections.abc import Callable
@@ -27,8 +16,8 @@ from fourbar_ros.mechanism import (
 from fourbar_ros.mechanism.case import Case, simulate
 from fourbar_ros.mechanism.dynamics import mass_matrix
 from fourbar_ros.mechanism.forces import NOTHING
-from fourbar_ros.mechanism.layout import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
-from fourbar_ros.mechanism.motion import move_with_cosines
+from fourbar_ros.mechanism.integration import move_with_cosines
+from fourbar_ros.mechanism.state import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -340,7 +329,7 @@ def test_mismatch_folds_as_kane_equations_do(
 ) -> None:
     """Beside SymPy's derivation, integrated with steps that follow the fold: 1e-5 deg."""
     pytest.importorskip('sympy')
-    from fourbar_ros.analysis.independent import kane
+    from fourbar_ros.studies.independent import kane
     case = fold(mismatch, change_point, rate, link)
     expected = kane.simulate(case).link_angles
     np.testing.assert_allclose(
@@ -355,7 +344,7 @@ def test_mismatch_folds_as_in_a_stiff_engine(
 ) -> None:
     """Beside MuJoCo, RK4 at 0.1 ms, as stiff as it stays stable: to the same side, 0.1 deg."""
     pytest.importorskip('mujoco')
-    from fourbar_ros.analysis.independent.mujoco_model import MujocoLinkage, State, stiff
+    from fourbar_ros.studies.independent.mujoco_model import MujocoLinkage, State, stiff
     case = fold(mismatch, change_point, rate, link)
     start = State(case.link_angles, case.link_rates, NONE, case.link_rates, np.zeros(2),
                   np.zeros(2))

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Joints that give: an independent derivation, conservation, the rigid limit, change points."""
 
@@ -22,7 +11,8 @@ from typing import Any
 from fourbar_ros.mechanism import assemble, branch_of, Mechanism, reduced_form
 from fourbar_ros.mechanism.compliant import RESOLUTION
 from fourbar_ros.mechanism.forces import NOTHING
-from fourbar_ros.mechanism.layout import (
+from fourbar_ros.mechanism.integration import move_held, move_with_cosines
+from fourbar_ros.mechanism.state import (
     CENTRE_POSITION,
     CENTRE_REST,
     CENTRE_VELOCITY,
@@ -34,7 +24,6 @@ from fourbar_ros.mechanism.layout import (
     WHEEL_ANGLES,
     WHEEL_SPEEDS,
 )
-from fourbar_ros.mechanism.motion import move_held, move_with_cosines
 from fourbar_ros.mechanism.totals import (
     body_motion,
     joint_gaps,

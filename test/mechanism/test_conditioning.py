@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Conditioning over configurations: beside Kane's method, singular values, and by hand."""
 
@@ -82,7 +71,7 @@ def test_any_linkage_beside_singular_values(
 def test_condition_is_that_of_kanes_method(seed: int, random_linkage: Draw) -> None:
     """The mass matrix that SymPy derives along the chain, translation and c, d eliminated."""
     pytest.importorskip('sympy')
-    from fourbar_ros.analysis.independent import kane
+    from fourbar_ros.studies.independent import kane
 
     linkage = random_linkage(np.random.default_rng(seed))
     closed = configurations(linkage, 'open')

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The reduced equations against facts derived by hand and against an independent derivation."""
 
@@ -27,15 +16,15 @@ from fourbar_ros.mechanism import (
 from fourbar_ros.mechanism.constrained import constrained_accelerations, directions
 from fourbar_ros.mechanism.dynamics import ChangePointError, mass_matrix
 from fourbar_ros.mechanism.forces import NOTHING
-from fourbar_ros.mechanism.layout import (
+from fourbar_ros.mechanism.integration import evaluate
+from fourbar_ros.mechanism.reduced import reduced_accelerations, side_of_joint_3
+from fourbar_ros.mechanism.state import (
     LINK_ANGLES,
     LINK_RATES,
     make_state,
     WHEEL_ANGLES,
     WHEEL_SPEEDS,
 )
-from fourbar_ros.mechanism.motion import evaluate
-from fourbar_ros.mechanism.reduced import reduced_accelerations, side_of_joint_3
 import numpy as np
 from numpy.typing import NDArray
 import pytest

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What acts besides the motors: closed forms, balances, and an independent derivation."""
 
@@ -18,11 +7,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from fourbar_ros.errors import FourbarError
+from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.constrained import constrained_accelerations, directions
 from fourbar_ros.mechanism.forces import ForceError, grip, NOTHING, Surroundings, surroundings
-from fourbar_ros.mechanism.layout import (
+from fourbar_ros.mechanism.integration import evaluate, move_with_cosines
+from fourbar_ros.mechanism.reduced import reduced_accelerations, side_of_joint_3
+from fourbar_ros.mechanism.state import (
     CENTRE_POSITION,
     CENTRE_VELOCITY,
     LINK_ANGLES,
@@ -30,8 +21,6 @@ from fourbar_ros.mechanism.layout import (
     make_state,
     WHEEL_SPEEDS,
 )
-from fourbar_ros.mechanism.motion import evaluate, move_with_cosines
-from fourbar_ros.mechanism.reduced import reduced_accelerations, side_of_joint_3
 from fourbar_ros.mechanism.totals import (
     body_motion,
     mechanical_energy,

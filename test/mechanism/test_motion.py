@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The integrated motion: reference runs, order and conservation."""
 
@@ -27,7 +16,8 @@ from fourbar_ros.mechanism import (
 )
 from fourbar_ros.mechanism.dynamics import mass_matrix
 from fourbar_ros.mechanism.forces import NOTHING
-from fourbar_ros.mechanism.layout import (
+from fourbar_ros.mechanism.integration import move_held, move_with_cosines
+from fourbar_ros.mechanism.state import (
     CENTRE_POSITION,
     CENTRE_VELOCITY,
     LINK_ANGLES,
@@ -36,7 +26,6 @@ from fourbar_ros.mechanism.layout import (
     WHEEL_ANGLES,
     WHEEL_SPEEDS,
 )
-from fourbar_ros.mechanism.motion import move_held, move_with_cosines
 from fourbar_ros.mechanism.totals import linear_momentum
 import numpy as np
 from numpy.typing import NDArray

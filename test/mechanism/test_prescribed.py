@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Wheels whose angle relative to their link is prescribed, mixed with wheels driven by torque."""
 
@@ -21,8 +10,8 @@ from itertools import product
 from fourbar_ros.mechanism import angular_momentum, Mechanism
 from fourbar_ros.mechanism.case import Case, simulate
 from fourbar_ros.mechanism.forces import surroundings
-from fourbar_ros.mechanism.layout import LINK_ANGLES, LINK_RATES, WHEEL_SPEEDS
-from fourbar_ros.mechanism.motion import evaluate
+from fourbar_ros.mechanism.integration import evaluate
+from fourbar_ros.mechanism.state import LINK_ANGLES, LINK_RATES, WHEEL_SPEEDS
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -64,7 +53,7 @@ def test_motion_agrees_with_kane_equations(
     seed: int, prescribed: Mask, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
     pytest.importorskip('sympy')
-    from fourbar_ros.analysis.independent import kane
+    from fourbar_ros.studies.independent import kane
 
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)

@@ -1,23 +1,12 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Motions side by side are those that each makes alone."""
 
 from fourbar_ros.mechanism import assemble, Mechanism
 from fourbar_ros.mechanism.forces import NOTHING, surroundings
-from fourbar_ros.mechanism.layout import make_state
-from fourbar_ros.mechanism.motion import move_held
+from fourbar_ros.mechanism.integration import move_held
+from fourbar_ros.mechanism.state import make_state
 from fourbar_ros.mechanism.tracks import link_tracks
 import numpy as np
 

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A colcon workspace builds, finds, runs and tests the package, linked or copied."""
 
@@ -66,7 +55,7 @@ def test_simulate_writes_a_table(workspace, folder, check):
 
 
 def test_code_and_presets_are_those_of_the_workspace(workspace, check):
-    code = ('import fourbar_ros; from fourbar_ros.configuration import config_file as f; '
+    code = ('import fourbar_ros; from fourbar_ros.common.config_files import config_file as f; '
             'print(fourbar_ros.__file__); print(f("mechanism", "paper"))')
     printed = check(*SOURCED, sys.executable, '-c', code, cwd=workspace, PATH=PATH)
     module, preset = map(Path, printed.splitlines())

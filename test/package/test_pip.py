@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """`pip install .` into a fresh environment gives all commands and all files."""
 
@@ -92,6 +81,7 @@ def test_share_holds_what_the_tree_holds(prefix):
 
 
 def test_presets_are_found_from_anywhere(prefix, check, tmp_path):
-    code = 'from fourbar_ros.configuration import config_file as f; print(f("mechanism", "paper"))'
+    code = ('from fourbar_ros.common.config_files import config_file as f; '
+            'print(f("mechanism", "paper"))')
     found = check(prefix / 'bin' / 'python', '-c', code, cwd=tmp_path).strip()
     assert Path(found) == prefix / 'share' / 'fourbar_ros' / 'config' / 'mechanism_paper.yaml'

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Power of single motors: what is left when it is cut, and how they begin when it comes back."""
 
@@ -21,8 +10,8 @@ from fourbar_ros.mechanism import load_mechanism, Mechanism
 from fourbar_ros.plant import load_table, parse_fault, Plant, Table
 from fourbar_ros.plant.bearings import bearing_torque, drives_of
 from fourbar_ros.plant.faults import wheel_faults
-from fourbar_ros.plant.motion import Boxed, conditions_of, SOUND
 from fourbar_ros.plant.sensors import LinkSensorSettings
+from fourbar_ros.plant.step import Boxed, conditions_of, SOUND
 from fourbar_ros.plant.table import WheelBearings, WheelEncoders
 import numpy as np
 from numpy.typing import NDArray

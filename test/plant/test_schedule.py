@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Faults come and go at their time, and a schedule that cannot be followed is refused."""
 
@@ -19,10 +8,15 @@ from math import inf, nan
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.configuration import load_yaml
+from fourbar_ros.common.config_files import load_yaml
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES
+from fourbar_ros.plant.fault_schedule import (
+    FaultBoard,
+    FaultChange,
+    parse_schedule,
+    ScheduledFault,
+)
 from fourbar_ros.plant.faults import Fault, FaultError
-from fourbar_ros.plant.schedule import FaultBoard, FaultChange, parse_schedule, ScheduledFault
 import pytest
 
 TARGETS = (*LINK_NAMES, *FLYWHEEL_NAMES)

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A table file is taken as it stands or refused, with the name of what is wrong."""
 
@@ -20,7 +9,7 @@ from math import pi
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.configuration import ConfigurationError, presets
+from fourbar_ros.common.config_files import ConfigurationError, presets
 from fourbar_ros.plant import load_table, Table, TableError
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import quantum, WheelEncoders

@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Simulated motion of the links under the measured motion of their wheels.
@@ -33,7 +22,7 @@ from fourbar_ros.mechanism import LINK_NAMES, Mechanism, nearest_assembly
 from fourbar_ros.mechanism.constants import record
 from fourbar_ros.mechanism.dynamics import gamma_matrix
 from fourbar_ros.mechanism.forces import FIELDS, Surroundings
-from fourbar_ros.mechanism.layout import make_state
+from fourbar_ros.mechanism.state import make_state
 from fourbar_ros.mechanism.tracks import link_tracks
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, make_lsq_spline

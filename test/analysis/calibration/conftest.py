@@ -1,16 +1,5 @@
 # Copyright 2026 The fourbar_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Recordings of excitations of the simulated table, without ROS."""
 
@@ -24,7 +13,7 @@ from fourbar_ros.analysis.calibration.excitation import Excitation
 from fourbar_ros.analysis.calibration.signals import link_signal, LinkSignal, WheelSignal
 from fourbar_ros.device import SimulatedTable
 from fourbar_ros.device.command import drive_by_name
-from fourbar_ros.device.protocol import no_torque
+from fourbar_ros.device.interface import no_torque
 from fourbar_ros.mechanism import LINK_NAMES, load_mechanism, Mechanism
 from fourbar_ros.plant import InitialState, load_table, Plant, Table
 import numpy as np

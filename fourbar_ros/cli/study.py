@@ -1,0 +1,70 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""`fourbar study`: run a study and check what comes out."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+import json
+from pathlib import Path
+import sys
+
+from fourbar_ros.studies import load_study, OPTIONS, STUDIES
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    known = '\n'.join(f'  {name:<14}{study.summary}' for name, study in STUDIES.items())
+    parser.epilog = (f'studies:\n{known}\n\n'
+                     'Exits with 0 when every check is kept, with 1 when one is missed.')
+    parser.add_argument('name', metavar='NAME', help='which study')
+    parser.add_argument(
+        '-o', '--output', metavar='FOLDER', type=Path,
+        help='where figures and tables go (made if missing, default study_NAME)')
+    parser.add_argument(
+        '--json', metavar='FILE', type=Path,
+        help='checks and numbers, units in their names (also in FOLDER as NAME.json)')
+    some = parser.add_argument_group('what some studies take')
+    for name, option in OPTIONS.items():
+        takes = ', '.join(study for study, entry in STUDIES.items() if name in entry.options)
+        meaning = f'{option.meaning}; {takes}'
+        if option.positional:
+            parser.add_argument(name, metavar=option.metavar, nargs='?', type=option.kind,
+                                help=meaning)
+        else:
+            some.add_argument(f'--{name}', metavar=option.metavar, type=option.kind, help=meaning)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the study, print and write what it found."""
+    from fourbar_ros.cli.progress import show_progress
+    from fourbar_ros.common.checks import checks_as_json, print_checks
+    from fourbar_ros.common.output_files import check_file, kept_folder, write_files
+    from fourbar_ros.kernels.compiler import announced
+
+    folder = args.output or Path(f'study_{args.name}')
+    study = load_study(args.name, folder, **{
+        name: value for name in OPTIONS if (value := getattr(args, name)) is not None})
+    # Made before the work, not after it.
+    with kept_folder(folder):
+        if args.json:
+            check_file(args.json)
+        with announced():
+            result = study(show_progress)
+        document = {'study': args.name, 'checks': checks_as_json(result.checks),
+                    'skipped': list(result.skipped), **result.data}
+        text = json.dumps(document, indent=2, allow_nan=False) + '\n'
+        files: Mapping[Path, str | bytes] = {
+            **{folder / name: content for name, content in result.files.items()},
+            folder / (result.document or f'{args.name}.json'): text,
+            **({args.json: text} if args.json else {})}
+        write_files(files)
+
+    print(result.text)
+    print_checks(result.checks)
+    print('\n'.join(str(path) for path in files))
+    for reason in result.skipped:
+        print(f'fourbar study: {reason}', file=sys.stderr)
+    return 0 if all(check.passed for check in result.checks) else 1

@@ -1,0 +1,202 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Compile the numerical kernels, and keep the machine code where it cannot go stale.
+
+Numba checks its cache against the file of the compiled function alone, so an edited callee in
+another module would go unnoticed, and it refuses to import at all where no folder is writable.
+So the code is kept in the user's cache folder under a hash of everything it is made from. Set
+NUMBA_CACHE_DIR to choose a folder of your own, which is then yours to clear.
+"""
+
+from collections.abc import Callable, Iterator
+import contextlib
+import functools
+import hashlib
+import logging
+import os
+from pathlib import Path
+import platform
+import re
+import shutil
+import stat
+import sys
+import tempfile
+import time
+from typing import Any, overload, TextIO, TypeVar
+
+import numba
+from numba.core import event
+import numpy
+
+# Kernels live in these rooms and call nothing outside them.
+ROOMS = ('kernels', 'mechanism', 'plant', 'estimation', 'control')
+UNUSED_AFTER = 30 * 24 * 3600.0
+"""Seconds after which the code of other versions is dropped."""
+
+prange = numba.prange
+"""The parallel range of a kernel compiled with `parallel=True`."""
+
+_OPTIONS = {'error_model': 'numpy', 'fastmath': False}
+_Function = TypeVar('_Function', bound=Callable[..., Any])
+
+
+@overload
+def kernel(function: _Function, /) -> _Function: ...
+
+
+@overload
+def kernel(**options: Any) -> Callable[[_Function], _Function]: ...
+
+
+def kernel(function: _Function | None = None, /, **options: Any) -> Any:
+    """
+    Compile a function with numba in nopython mode, and keep the code.
+
+    Use it bare or with options of `numba.njit`: `@kernel`, `@kernel(parallel=True)`. Division by
+    zero gives inf or nan as in numpy, and floating point is not reordered.
+    """
+    if function is None:
+        return functools.partial(kernel, **options)
+    directory = cache_directory()
+    options = {'cache': directory is not None, **_OPTIONS, **options}
+    with _numba_caches_in(directory):
+        return numba.njit(**options)(function)
+
+
+@contextlib.contextmanager
+def announced(stream: TextIO | None = None) -> Iterator[None]:
+    """
+    Say it, while the block runs, when kernels have to be compiled, and which.
+
+    Nothing is said where the machine code comes from the cache. On a terminal one line shows the
+    kernel at work and is wiped at the end.
+
+    :param stream: where to, by default stderr.
+    """
+    show = _Announcement(stream or sys.stderr)
+    with event.install_listener('numba:compile', show):
+        try:
+            yield
+        finally:
+            show.finish()
+
+
+class _Announcement(event.Listener):  # type: ignore[misc]
+    """Shows the outermost function that is being compiled."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._done = 0
+
+    def on_start(self, occasion: event.Event) -> None:
+        if not self._done:
+            print('Compiling the kernels, once after an installation (half a minute)',
+                  file=self._stream, flush=True)
+        self._done += 1
+        if self._stream.isatty():
+            name = occasion.data['dispatcher'].__name__
+            print(f'\r  {self._done:3d} {name:<40}', end='', file=self._stream, flush=True)
+
+    def on_end(self, occasion: event.Event) -> None:
+        """Leave the line: the next kernel overwrites it."""
+
+    def finish(self) -> None:
+        """Wipe the line."""
+        if self._done and self._stream.isatty():
+            print(f'\r{"":<44}\r', end='', file=self._stream, flush=True)
+
+
+@functools.lru_cache(maxsize=None)
+def cache_directory() -> Path | None:
+    """
+    Return the folder of the compiled code: None when nothing is writable and nothing is kept.
+
+    Where the user's cache is not writable it is a private folder for temporary files, with a
+    warning.
+    """
+    name = _fingerprint()
+    if numba.config.CACHE_DIR:
+        wanted = Path(numba.config.CACHE_DIR)
+    else:
+        wanted = _user_cache() / name
+        _drop_unused(wanted)
+    with contextlib.suppress(OSError):
+        return _writable(wanted)
+    logger = logging.getLogger(__name__)
+    with contextlib.suppress(OSError):
+        directory = _writable(_private_temporary() / name)
+        logger.warning('cannot write to %s: compiled code is kept in %s', wanted, directory)
+        return directory
+    logger.warning('cannot write to %s nor to a temporary folder: every start compiles', wanted)
+    return None
+
+
+@contextlib.contextmanager
+def _numba_caches_in(directory: Path | None) -> Iterator[None]:
+    """
+    Tell numba where to cache, for one decoration.
+
+    Through its configuration and not the environment: children may run other sources. And not for
+    longer, so that other people's compiled functions stay where they expect them.
+    """
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(directory or '')
+    try:
+        yield
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def _fingerprint() -> str:
+    """Return a name for all that the machine code depends on, the processor excepted."""
+    digest = hashlib.sha256()
+    for version in (platform.python_version(), numba.__version__, numpy.__version__):
+        digest.update(version.encode() + b'\0')
+    package = Path(__file__).parent.parent
+    for room in ROOMS:
+        for source in sorted((package / room).rglob('*.py')):
+            digest.update(source.relative_to(package).as_posix().encode() + b'\0')
+            digest.update(source.read_bytes() + b'\0')
+    return digest.hexdigest()[:16]
+
+
+def _writable(directory: Path) -> Path:
+    """Make the folder, mark it as used now, and raise OSError unless a file can be written."""
+    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=directory).close()
+    os.utime(directory)
+    return directory
+
+
+def _private_temporary() -> Path:
+    """
+    Return this user's folder for temporary files.
+
+    Numba unpickles what it finds in its cache, so a folder that someone else could have made
+    under the same name must not be used.
+    """
+    directory = Path(tempfile.gettempdir()) / f'fourbar_ros-{os.getuid()}'
+    with contextlib.suppress(FileExistsError):
+        directory.mkdir(mode=0o700)
+    status = directory.lstat()
+    if (stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid()
+            and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
+        return directory
+    return Path(tempfile.mkdtemp(prefix='fourbar_ros-'))
+
+
+def _user_cache() -> Path:
+    home = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
+    return Path(home) / 'fourbar_ros'
+
+
+def _drop_unused(in_use: Path) -> None:
+    """Remove the folders of other versions that nobody has used for UNUSED_AFTER seconds."""
+    oldest = time.time() - UNUSED_AFTER
+    with contextlib.suppress(OSError):
+        for directory in in_use.parent.iterdir():
+            if (re.fullmatch('[0-9a-f]{16}', directory.name) and directory != in_use
+                    and directory.stat().st_mtime < oldest):
+                shutil.rmtree(directory, ignore_errors=True)

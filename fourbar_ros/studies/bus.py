@@ -1,0 +1,199 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Ten minutes of commands and samples between the host and emulated links, over UDP on loopback.
+
+Two processes, no ROS: what is timed is the bus, its language, and what both ends make of it.
+"""
+
+from __future__ import annotations
+
+import io
+from multiprocessing import get_context
+from multiprocessing.synchronize import Event
+import time
+from typing import Any
+
+from fourbar_ros.common.checks import at_least, at_most
+from fourbar_ros.common.monotonic_clock import monotonic_ns
+from fourbar_ros.common.progress import Progress
+from fourbar_ros.device import Device, DeviceState, Drive, SimulatedTable
+from fourbar_ros.hardware.can_port import Port
+from fourbar_ros.hardware.dbc_codec import DbcCodec
+from fourbar_ros.hardware.emulator import ClockSettings, Emulator
+from fourbar_ros.hardware.firmware import FirmwareSettings
+from fourbar_ros.hardware.poll_loop import attend
+from fourbar_ros.hardware.prototype import Prototype
+from fourbar_ros.hardware.safety_table import load_safety
+from fourbar_ros.hardware.udp_bus import UdpBus
+from fourbar_ros.mechanism import load_mechanism
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.plant import InitialState, load_table, Plant
+from fourbar_ros.plotting import style
+from fourbar_ros.plotting.style import COLOURS
+from fourbar_ros.studies import Result, StudyError
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+import numpy as np
+
+SECONDS = 600
+PERIOD_NS = 4_000_000
+# A tick of the node waits so long for the answers of the wheels [s]; here it waits longer than any
+# limit, to see how long it takes.
+NODE_WAITS_S, ANSWER_TIMEOUT_S = 2e-3, 2e-2
+# So long everything may take to come up [s].
+START_UP_S = 30.0
+# The wheels are pushed to and fro, gently [N m], for so many ticks each way.
+TORQUE, TICKS_EACH_WAY = 1e-3, 250
+MEDIAN_MS, SLOWEST_MS = 1.0, 5.0
+NO_TORQUE = Drive(np.zeros(4), np.zeros(4, dtype=bool), np.zeros(4, dtype=bool))
+DPI = 120
+
+# Counters of a link, at the host, that stand for frames which did not make it. An answer that came
+# when its tick did not wait for it any more is not lost, but the tick went on without it.
+LOST = ('lost_angles', 'lost_heartbeats', 'replayed', 'wrong_time')
+
+
+def run(progress: Progress, seconds: int = SECONDS) -> Result:
+    """Drive emulated links for so long, and count and time what comes back."""
+    # Compiled here, where that is announced, and kept for the process of the links.
+    _emulator()
+    context = get_context('spawn')
+    stop, (here, there) = context.Event(), context.Pipe()
+    links = context.Process(target=_be_links, args=(stop, there), daemon=True)
+    host = UdpBus('127.0.0.1:0', peers=())
+    links.start()
+    try:
+        if not here.poll(START_UP_S):
+            raise StudyError(f'the emulated links did not start within {START_UP_S:g} s')
+        host.add_peer(here.recv())
+        here.send(_address(host))
+        prototype = Prototype(
+            load_mechanism('prototype'), lambda: Port(host, 'fourbar_udp', _address(host)),
+            DbcCodec(), load_safety('prototype'), PERIOD_NS, ANSWER_TIMEOUT_S, False, monotonic_ns,
+            lambda time_ns: time_ns)
+        round_trips, counts = _drive(prototype, progress, seconds)
+        prototype.close()
+        stop.set()
+        told = here.recv() if here.poll(START_UP_S) else {}
+    finally:
+        stop.set()
+        links.join(START_UP_S)
+        host.shutdown()
+    return _result({**counts, **told}, round_trips, seconds)
+
+
+def _address(bus: UdpBus) -> str:
+    host, port = bus.address
+    return f'{host}:{port}'
+
+
+def _emulator() -> Emulator:
+    """Make the four links, everything compiled before somebody speaks to them."""
+    plant = Plant(load_mechanism('prototype'), load_table('prototype'), InitialState(), 5e-4,
+                  np.random.default_rng(0))
+    emulator = Emulator(
+        SimulatedTable(plant, 1_000_000), DbcCodec(), range(4), FirmwareSettings(),
+        ClockSettings((100.0, 107.0, 114.0, 121.0), (3e-5, 1.5e-5, -1.5e-5, -3e-5)),
+        np.random.default_rng(), monotonic_ns(), time.time_ns())
+    emulator.advance(emulator.next_ns)
+    return emulator
+
+
+def _be_links(stop: Event, host: Any) -> None:
+    """Be the four links, until told to stop; then tell what was lost on the way here."""
+    emulator = _emulator()
+    bus = UdpBus('127.0.0.1:0', peers=())
+    host.send(_address(bus))
+    bus.add_peer(host.recv())
+    port = Port(bus, 'fourbar_udp', _address(bus))
+    while not stop.is_set():
+        attend(emulator, port, monotonic_ns)
+    host.send({f'commands_{kind}': sum(one.counts[kind] for one in emulator.firmware)
+               for kind in ('lost_commands', 'replayed')})
+    port.close()
+
+
+def _drive(prototype: Prototype, progress: Progress, seconds: int
+           ) -> tuple[Array, dict[str, int]]:
+    """Return the round trips of the ticks, at most the time-out, and counts."""
+    begin_ns, tick = monotonic_ns(), 0
+
+    def step(drive: Drive) -> float | None:
+        nonlocal tick
+        due_ns = begin_ns + tick * PERIOD_NS
+        tick += 1
+        if (ahead_ns := due_ns - monotonic_ns()) > 0:
+            time.sleep(ahead_ns * 1e-9)
+        return prototype.step(due_ns, drive).timing[0]
+
+    while prototype.arming_blockers() or tick < TICKS_EACH_WAY:
+        step(NO_TORQUE)
+        if tick * PERIOD_NS > START_UP_S * 1e9:
+            raise StudyError(f'cannot be armed: {"; ".join(prototype.arming_blockers())}')
+    _arm(prototype)
+    before, found, missing = _counts(prototype), [], 0
+    for second in progress(range(seconds), seconds):
+        torque = TORQUE if second % 2 else -TORQUE
+        drive = Drive(np.full(4, torque), np.zeros(4, dtype=bool), np.ones(4, dtype=bool))
+        for _ in range(round(1e9) // PERIOD_NS):
+            answered = step(drive)
+            found.append(ANSWER_TIMEOUT_S if answered is None else answered)
+            missing += sum(link.missing for link in prototype.links)
+            prototype.drive(drive)
+    step(NO_TORQUE)
+    counts = {kind: count - before[kind] for kind, count in _counts(prototype).items()}
+    return np.array(found), {**counts, 'lost_answers': missing - counts['late']}
+
+
+def _arm(device: Device) -> None:
+    device.gate_changed(DeviceState.ARMED)
+
+
+def _counts(prototype: Prototype) -> dict[str, int]:
+    facts = prototype.facts()
+    bus = {f'frames_{kind}': int(str(facts[f'frames_{kind}'])) for kind in ('sent', 'received')}
+    return {**bus, **{kind: sum(link.counts[kind] for link in prototype.links)
+                      for kind in (*LOST, 'late')}}
+
+
+def _result(counts: dict[str, int], round_trips: Array, seconds: int) -> Result:
+    lost = sum(count for kind, count in counts.items()
+               if kind != 'late' and not kind.startswith('frames_'))
+    late = int((round_trips > NODE_WAITS_S).sum())
+    middle, slow, slowest = np.percentile(round_trips * 1e3, [50.0, 99.0, 100.0]).tolist()
+    data = {**counts, 'seconds': seconds, 'ticks': len(round_trips),
+            'ticks_later_than_the_node_waits': late, 'round_trip_p50_ms': middle,
+            'round_trip_p99_ms': slow, 'round_trip_max_ms': slowest}
+    text = '\n'.join([
+        f'{len(round_trips)} ticks, {counts["frames_sent"]} frames to the links, '
+        f'{counts["frames_received"]} from them',
+        f'round trip, from the question to the last of eight answers: median {middle:.3f} ms, '
+        f'99 % {slow:.3f} ms, slowest {slowest:.3f} ms; {late} took longer than the '
+        f'{NODE_WAITS_S * 1e3:g} ms for which the node waits'])
+    checks = [at_most('frames_lost', lost, '', 0),
+              at_least('frames_received', counts['frames_received'], '', 12.0 * len(round_trips)
+                       * 0.97),
+              at_most('round_trip_p50_ms', middle, 'ms', MEDIAN_MS),
+              at_most('round_trip_p99_ms', slow, 'ms', SLOWEST_MS)]
+    return Result(checks, data, text, {'bus.png': _png(round_trips * 1e3)})
+
+
+def _png(round_trips: Array) -> bytes:
+    """Draw how many of the round trips took longer than so long."""
+    with rc_context(style.RC):
+        figure = Figure(figsize=(style.WIDTH_IN, 3.2), layout='constrained')
+        axes = figure.subplots()
+        ordered = np.sort(round_trips)
+        axes.plot(ordered, 1.0 - np.arange(len(ordered)) / len(ordered), color=COLOURS['link_a'])
+        for limit, share in ((MEDIAN_MS, 0.5), (SLOWEST_MS, 0.01)):
+            axes.plot(limit, share, 'v', color=COLOURS['limit'])
+            axes.annotate(f'limit {limit:g} ms', (limit, share), (6, 4),
+                          textcoords='offset points', color=COLOURS['limit'])
+        axes.set(xscale='log', yscale='log', xlabel='round trip [ms]',
+                 ylabel='share that took longer', ylim=(0.5 / len(ordered), 1.3))
+        axes.set_title('From the question of a tick to the last answer')
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format='png', dpi=DPI, facecolor=COLOURS['paper'])
+        return buffer.getvalue()

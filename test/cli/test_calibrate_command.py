@@ -1,0 +1,149 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""`fourbar calibrate --bag` as it is typed: files whole or not at all, and what is refused."""
+
+from importlib.util import module_from_spec, spec_from_file_location
+import json
+from pathlib import Path
+
+from fourbar_ros.analysis.calibration.mechanism_file import mechanism_text, notes_of
+from fourbar_ros.cli.main import main
+from fourbar_ros.common.config_files import load_yaml
+from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism, Mechanism
+import numpy as np
+import pytest
+
+POSE = [0.0, np.pi / 3, 0.0, np.pi / 3]
+OFFSETS = np.array([0.01, -0.02, 0.03, 0.0])
+AT_POSE = ['encoders', '--bag', 'jig', '--pose', 'link_a=0', 'link_b=60deg']
+
+
+def calibrate(*arguments):
+    """Run the command, and return its exit code."""
+    return main(['calibrate', *arguments])
+
+
+@pytest.fixture(scope='module')
+def synthetic():
+    path = Path(__file__).parents[1] / 'analysis' / 'synthetic.py'
+    spec = spec_from_file_location('synthetic', path)
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def jig(synthetic, tmp_path, monkeypatch):
+    """Record links in a jig, with known offsets and noise; seed 0. Work where the bag is."""
+    generator = np.random.default_rng(0)
+    stamps = range(1_000_000_000, 2_600_000_000, 4_000_000)
+    still = np.zeros(4)
+    synthetic.write_bag(tmp_path / 'jig', {
+        '/device_status': [(1, synthetic.status(state='disarmed', mechanism='prototype'))],
+        '/link_angles': [(stamp, synthetic.joint_state(
+            stamp, LINK_NAMES, POSE + OFFSETS + 1e-3 * generator.standard_normal(4)))
+            for stamp in stamps],
+        '/flywheel_states': [(stamp, synthetic.joint_state(
+            stamp, FLYWHEEL_NAMES, still, still, still)) for stamp in stamps]})
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_mechanism_file_has_the_offsets_and_all_else(jig, capsys):
+    """Five standard errors of the noise of 400 samples."""
+    assert calibrate(*AT_POSE, '-o', 'new.yaml', '--json', 'found.json') == 0
+    output, errors = capsys.readouterr()
+    assert errors == ''
+    assert output.splitlines()[-2:] == ['new.yaml', 'found.json']
+    before, after = load_mechanism('prototype'), load_mechanism('new.yaml')
+    np.testing.assert_allclose(after.link_angle_offsets, OFFSETS, atol=5.0 * 1e-3 / 20.0)
+    for key in load_yaml('new.yaml'):
+        if key != 'link_angle_offsets':
+            np.testing.assert_array_equal(getattr(after, key), getattr(before, key), err_msg=key)
+    note, = notes_of(Path('new.yaml'))
+    assert note.startswith('link_angle_offsets, ') and note.endswith(', from jig')
+    found = json.loads(Path('found.json').read_text())
+    assert found['quantities'][0]['value'] == after.link_angle_offsets[0]
+    assert [check['passed'] for check in found['checks']] == [True] * 8
+
+
+def test_offsets_add_up_and_notes_stay(jig):
+    """What the device took out already is part of the whole."""
+    assert calibrate(*AT_POSE, '-o', 'first.yaml') == 0
+    assert calibrate(*AT_POSE, '--mechanism', 'first.yaml', '-o', 'second.yaml') == 0
+    first, second = (load_mechanism(name).link_angle_offsets
+                     for name in ('first.yaml', 'second.yaml'))
+    np.testing.assert_allclose(second, 2.0 * first, rtol=1e-12)
+    assert len(notes_of(Path('second.yaml'))) == 2
+
+
+def test_existing_file_stays_unless_forced(jig, capsys):
+    Path('new.yaml').write_text('mine')
+    assert calibrate(*AT_POSE, '-o', 'new.yaml') == 2
+    assert capsys.readouterr().err == (
+        'fourbar calibrate: new.yaml exists already: choose another name or give --force\n')
+    assert Path('new.yaml').read_text() == 'mine'
+    assert calibrate(*AT_POSE, '-o', 'new.yaml', '--force') == 0
+    assert load_mechanism('new.yaml').link_angle_offsets.any()
+
+
+@pytest.mark.parametrize(('arguments', 'complaint'), [
+    (['encoders', '--bag', 'jig', '--pose', 'link_a=0', 'link_x=1'],
+     "unknown link 'link_x' in the pose (known are link_a, link_b, link_c, link_d)"),
+    (['encoders', '--bag', 'jig', '--pose', 'link_a=0'],
+     'the pose names 1 of the links, and two are needed at least'),
+    (['encoders', '--bag', 'jig', '--pose', 'link_a=0', 'link_a=1'],
+     'link_a is named twice in the pose'),
+    (['encoders', '--bag', 'jig', '--pose', 'link_a=here', 'link_b=1'],
+     "cannot read 'link_a=here': write link_a=0.5 [rad] or link_a=30deg"),
+    (['encoders', '--bag', 'jig', '--pose', 'link_a=0', 'link_b=60deg', 'link_c=20deg'],
+     'the pose does not close the loop within 0.002 rad'),
+    ([*AT_POSE, '--mechanism', 'none'], "no mechanism 'none'"),
+    ([*AT_POSE, '-o', 'nowhere/new.yaml'], 'cannot write nowhere/new.yaml: no such folder'),
+    (['wheels', '--bag', 'jig'], 'jig: no wheel was driven and turned fast'),
+    (['wheels', '--bag', 'jig', '--figure', 'fit.pdf'],
+     'cannot write fit.pdf: a picture is .png or .svg'),
+    (['links', '--bag', 'jig'], 'the links move for 0.0 s, and 8 s are needed at least'),
+    (['links', '--bag', 'none'], 'none: no such directory'),
+    (['wheels'], 'the wheels are going to turn: say so with --yes'),
+])
+def test_bad_input_is_one_line(jig, capsys, monkeypatch, arguments, complaint):
+    monkeypatch.setattr('sys.stdin', Path('/dev/null').open())
+    assert calibrate(*arguments) == 2
+    error, = capsys.readouterr().err.splitlines()
+    assert error.startswith('fourbar calibrate: ')
+    assert complaint in error
+    assert [path.name for path in jig.iterdir()] == ['jig']
+
+
+@pytest.mark.parametrize('kind', ['wheels', 'links', 'encoders'])
+def test_bag_without_the_topics_is_refused(synthetic, tmp_path, capsys, monkeypatch, kind):
+    monkeypatch.chdir(tmp_path)
+    synthetic.write_bag(tmp_path / 'other', {
+        '/device_status': [(1, synthetic.status(state='disarmed', mechanism='prototype'))]})
+    pose = ['--pose', 'link_a=0', 'link_b=1'] if kind == 'encoders' else []
+    assert calibrate(kind, '--bag', 'other', *pose) == 2
+    assert 'no topic ' in capsys.readouterr().err
+
+
+def test_joint_encoders_are_refused(synthetic, tmp_path, capsys):
+    stamps = range(10)
+    names = ['joint_1', 'joint_2', 'joint_3', 'joint_4', 'link_a']
+    bag = synthetic.write_bag(tmp_path / 'joints', {
+        '/device_status': [(1, synthetic.status(mechanism='prototype'))],
+        '/link_angles': [(stamp, synthetic.joint_state(stamp, names, np.zeros(5)))
+                         for stamp in stamps]})
+    assert calibrate('encoders', '--bag', str(bag), '--pose', 'link_a=0', 'link_b=1') == 2
+    assert 'only a device with an absolute sensor on each link' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('name', ['paper', 'prototype'])
+def test_mechanism_file_keeps_every_bit(tmp_path, name):
+    mechanism = load_mechanism(name)
+    path = tmp_path / 'copy.yaml'
+    path.write_text(mechanism_text(mechanism, ['once', 'twice']))
+    again = load_mechanism(str(path))
+    for key in vars(Mechanism)['__dataclass_fields__']:
+        np.testing.assert_array_equal(getattr(again, key), getattr(mechanism, key), err_msg=key)
+    assert notes_of(path) == ['once', 'twice']

@@ -1,0 +1,135 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""`fourbar replay` as it is typed."""
+
+from dataclasses import replace
+from importlib.util import module_from_spec, spec_from_file_location
+import json
+from pathlib import Path
+import shutil
+
+from fourbar_ros.analysis.bags import read_bag
+from fourbar_ros.cli.main import main
+from fourbar_ros.common.config_files import share_directory
+from fourbar_ros.estimation import EstimatorSettings
+from fourbar_ros.estimation.parameters import SETTINGS
+from fourbar_ros.loop import load_scenario
+import pytest
+
+
+@pytest.fixture(scope='module')
+def synthetic():
+    path = Path(__file__).parents[1] / 'analysis' / 'synthetic.py'
+    spec = spec_from_file_location('synthetic', path)
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope='module')
+def recorded(synthetic, tmp_path_factory):
+    scenario = replace(load_scenario('prototype'), duration=1.2,
+                       estimator=EstimatorSettings())
+    return synthetic.write_bag(tmp_path_factory.mktemp('bag') / 'run1',
+                               synthetic.closed_loop_messages(scenario))
+
+
+@pytest.fixture
+def bag(recorded, tmp_path, monkeypatch):
+    """Return the name of a bag in the working directory, with nothing else there."""
+    shutil.copytree(recorded, tmp_path / 'run1')
+    monkeypatch.chdir(tmp_path)
+    return 'run1'
+
+
+def test_all_files_are_beside_the_bag(bag, capsys):
+    assert main(['replay', bag, '--json', 'numbers.json']) == 0
+    output, errors = capsys.readouterr()
+    assert errors == ''
+    assert sorted(path.name for path in Path().iterdir()) == [
+        'numbers.json', 'run1', 'run1_replay']
+    new = Path('run1_replay')
+    assert sorted(path.name for path in new.iterdir()) == [
+        'comparison.json', 'comparison.png', 'metadata.yaml', 'run1_replay.mcap']
+    assert output.splitlines()[-4:] == [
+        str(Path.cwd() / new), *(str(Path.cwd() / new / name) for name in (
+            'comparison.json', 'comparison.png')), 'numbers.json']
+    numbers = json.loads((new / 'comparison.json').read_text())
+    assert numbers == json.loads(Path('numbers.json').read_text())
+    assert numbers['identical'] is True
+    assert len(read_bag(new).joint_states('estimate/link_states')) > 250
+
+
+def test_settings_that_were_used_are_told(bag, capsys):
+    assert main(['replay', bag, '-o', 'new', '--angle-noise', '0.004',
+                 '--counts-per-turn', '4096', '--gate-probability', '1']) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    for wanted in (['mechanism', 'prototype'], ['angle_noise', '0.004', 'rad'],
+                   ['counts_per_turn', '4096'], ['gate_probability', '1'],
+                   ['disturbance_torque', '1e-07', 'N', 'm/sqrt(Hz)']):
+        assert wanted in lines
+    settings = json.loads(Path('new/comparison.json').read_text())['settings']
+    assert settings == {'angle_noise': 0.004, 'counts_per_turn': 4096, 'gate_probability': 1.0,
+                        'gyro_noise': 5e-3, 'gyro_walk': 1e-4,
+                        'disturbance_torque': 1e-7, 'disturbance_walk': 1e-7,
+                        'closure_tolerance': 0.0}
+
+
+def test_parameters_file_of_the_nodes_does_too_and_options_come_first(bag):
+    text = (share_directory() / 'config' / 'nodes.yaml').read_text()
+    Path('nodes.yaml').write_text(
+        text.replace('angle_noise: 0.0017453', 'angle_noise: 0.003')
+        .replace('counts_per_turn: 16384', 'counts_per_turn: 512'))
+    assert main(['replay', bag, '-o', 'new', '--params-file', 'nodes.yaml',
+                 '--counts-per-turn', '0', '--mechanism', 'prototype']) == 0
+    numbers = json.loads(Path('new/comparison.json').read_text())
+    assert (numbers['mechanism'], numbers['settings']['angle_noise'],
+            numbers['settings']['counts_per_turn']) == ('prototype', 0.003, 0)
+
+
+def test_every_setting_has_its_option(capsys):
+    with pytest.raises(SystemExit):
+        main(['replay', '--help'])
+    text = ' '.join(capsys.readouterr().out.split())
+    for row in SETTINGS:
+        assert f'--{row.name.replace("_", "-")} X' in text
+        assert f'(default {row.default:g})' in text
+
+
+@pytest.mark.parametrize(('arguments', 'told'), [
+    (['nowhere'], 'nowhere: no such directory'),
+    (['run1', '-o', 'taken'], 'taken exists already'),
+    (['run1', '-o', 'run1/metadata.yaml/new'], 'is not a directory'),
+    (['run1', '--json', 'none/numbers.json'], 'no such folder'),
+    (['run1', '--angle-noise', '2'], 'angle_noise must be between 1e-09 and 1 rad, got 2'),
+    (['run1', '--angle-noise', 'much'], "angle_noise must be a number, got 'much'"),
+    (['run1', '--counts-per-turn', '1e4'], 'counts_per_turn must be of type int'),
+    (['run1', '--mechanism', 'papre'], 'available are paper, prototype'),
+    (['run1', '--namespace', 'lab'], 'nothing in the namespace /lab: there are /'),
+    (['run1', '--skip', '-1'], '--skip must be'),
+    (['run1', '--skip', '9'], 'skip less'),
+    (['run1', '--params-file', 'none.yaml'], 'none.yaml: No such file'),
+    (['run1', '--params-file', 'odd.yaml'], 'unknown setting angle_nose'),
+    (['run1', '--params-file', 'flat.yaml'], 'has no section ros__parameters'),
+    (['run1', '--params-file', 'others.yaml'], 'has no parameter of the node estimator')])
+def test_bad_input_is_one_line_and_leaves_nothing_behind(bag, capsys, arguments, told):
+    Path('taken').mkdir()
+    for name, text in (('odd', '/**/estimator: {ros__parameters: {angle_nose: 1.0}}'),
+                       ('flat', 'estimator: {angle_noise: 1.0}'),
+                       ('others', '/**/plant: {ros__parameters: {rate: 100.0}}')):
+        Path(f'{name}.yaml').write_text(text)
+    before = sorted(Path().iterdir())
+    assert main(['replay', *arguments]) == 2
+    output, errors = capsys.readouterr()
+    line, = errors.splitlines()
+    assert line.startswith('fourbar replay: ')
+    assert told in line
+    assert output == ''
+    assert sorted(Path().iterdir()) == before
+
+
+def test_unknown_option_is_refused(bag):
+    with pytest.raises(SystemExit) as caught:
+        main(['replay', bag, '--angle-nose', '1'])
+    assert caught.value.code == 2

@@ -1,0 +1,48 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""`fourbar setpoint link_a=0 link_b=90deg`, as it is typed."""
+
+from math import pi, radians
+
+from fourbar_ros.cli.setpoint import parse_goal, SetpointSyntaxError
+from fourbar_ros.common.errors import FourbarError
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import pytest
+
+
+@pytest.mark.parametrize(('text', 'name', 'angle'), [
+    ('link_a=0', 'link_a', 0.0),
+    ('link_b=90deg', 'link_b', pi / 2),
+    ('link_b=-90deg', 'link_b', -pi / 2),
+    ('link_c=1.57', 'link_c', 1.57),
+    ('link_c=1.57rad', 'link_c', 1.57),
+    ('link_d=-.5', 'link_d', -0.5),
+    ('link_d=1e-3', 'link_d', 1e-3),
+    ('link_d=450deg', 'link_d', 2.5 * pi),
+    ('anything=1', 'anything', 1.0),
+])
+def test_angles_are_in_radians_unless_they_say_degrees(
+    text: str, name: str, angle: float,
+) -> None:
+    assert parse_goal(text) == (name, pytest.approx(angle, rel=1e-15))
+
+
+@pytest.mark.parametrize('text', [
+    '', '=', 'link_a', 'link_a=', '=1', 'link_a=deg', 'link_a=rad', 'link_a=one', 'link_a=1=2',
+    'link_a=1grad', 'link_a=1degdeg', 'link_a=nan', 'link_a=inf', 'link_a=-infdeg', 'link_a=1e999',
+    'link_a 1', 'link_a=1,5', 'link_a:1'])
+def test_what_cannot_be_read_is_refused_with_an_example(text: str) -> None:
+    with pytest.raises(SetpointSyntaxError) as caught:
+        parse_goal(text)
+    assert repr(text) in str(caught.value)
+    assert 'link_a=30deg' in str(caught.value)
+    assert isinstance(caught.value, FourbarError)
+
+
+@settings(derandomize=True)
+@given(angle=st.floats(allow_nan=False, allow_infinity=False))
+def test_every_number_survives_its_way_through_the_command_line(angle: float) -> None:
+    assert parse_goal(f'link_a={angle!r}') == ('link_a', angle)
+    assert parse_goal(f'link_a={angle!r}deg') == ('link_a', radians(angle))

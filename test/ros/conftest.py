@@ -1,0 +1,547 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Nodes in processes of their own on a domain of their own, and a probe that watches them."""
+
+from contextlib import contextmanager, suppress
+import fcntl
+import gc
+from importlib.util import module_from_spec, spec_from_file_location
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from fourbar_ros.common.config_files import share_directory
+from fourbar_ros.hardware.bus_settings import free_addresses
+from fourbar_ros.loop.warm_up import warm_up
+from fourbar_ros.mechanism import FLYWHEEL_NAMES
+import pytest
+import rclpy
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+
+# Tests are no package: what they share is loaded from its file.
+_spec = spec_from_file_location('nursery', Path(__file__).with_name('nursery.py'))
+_nursery = module_from_spec(_spec)
+_spec.loader.exec_module(_nursery)
+
+DEADLINE_S = 20.0
+# Longest time without a command: more than this machine holds a process up.
+COMMAND_TIMEOUT_S = 1.0
+# A first answer that takes longer was lost on its way.
+ASK_AGAIN_S = 3.0
+DOMAINS = range(1, 102)
+# Where a process was killed: what it held in shared memory may be locked for ever.
+spoiled_domains = set()
+
+DEEP = QoSProfile(depth=5000)
+COMMAND = QoSProfile(depth=10)
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+# A node ends in this order, so that none complains about another one's silence.
+STOP_ORDER = ('controller', 'estimator', 'plant', 'hardware', 'prototype_emulator')
+
+# What a testbed may be, with the processes that it takes, the one with its topics last.
+DEVICES = {'plant': ('plant',), 'hardware': ('prototype_emulator', 'hardware')}
+
+
+def stamp_of(message):
+    """Return the stamp of a message [ns]."""
+    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+
+
+def set_stamp(message, stamp_ns):
+    """Write a stamp [ns] into a message, and return it."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+    return message
+
+
+def values_of(status):
+    """Return the values of a DiagnosticStatus as a dict."""
+    return {item.key: item.value for item in status.values}
+
+
+@contextmanager
+def claimed_domain():
+    """Hold a ROS domain that no other test run on this machine uses, under a lock file."""
+    for number in (number for number in DOMAINS if number not in spoiled_domains):
+        path = Path(tempfile.gettempdir(), f'fourbar_ros_domain_{number}.lock')
+        try:
+            lock = path.open('w')
+        except OSError:     # another user's
+            continue
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if os.fstat(lock.fileno()).st_ino != path.stat().st_ino:
+                    continue    # removed by its holder while we opened it
+            except (BlockingIOError, FileNotFoundError):
+                continue
+            try:
+                yield number
+            finally:
+                path.unlink()
+            return
+    pytest.fail('every domain from 1 to 101 is taken')
+
+
+def on_a_bus():
+    """Return parameters with which a host and its links find each other, on free ports."""
+    host, links = free_addresses(2)
+    return {name: {'bus.interface': 'fourbar_udp', 'bus.channel': own,
+                   'bus.options': f'peers={other}'}
+            for name, own, other in (
+                ('hardware', host, links), ('prototype_emulator', links, host))}
+
+
+class Process:
+    """
+    One `fourbar NAME ...` in a process of its own.
+
+    :param folder: for what it prints.
+    :param shared_memory: takes note of what it owns.
+    :param nursery: where to fork it, None for a fresh interpreter.
+    :ivar awaited: whether somebody waited for its end.
+    """
+
+    def __init__(self, name, arguments, folder, shared_memory, nursery):
+        self.name = name
+        self.awaited = False
+        self._shared_memory = shared_memory
+        self._out, self._err = (folder / f'{stream}.txt' for stream in ('stdout', 'stderr'))
+        if nursery is not None:
+            self._out.touch()
+            self._err.touch()
+            self.popen = nursery.start(
+                [name, *arguments], folder, self._out, self._err, dict(os.environ))
+            return
+        with self._out.open('wb') as out, self._err.open('wb') as err:
+            self.popen = subprocess.Popen(
+                [sys.executable, '-m', 'fourbar_ros', name, *arguments], cwd=folder,
+                stdin=subprocess.DEVNULL, stdout=out, stderr=err)
+
+    @property
+    def stdout(self):
+        """What it printed so far."""
+        return self._out.read_text()
+
+    @property
+    def stderr(self):
+        """What it complained about so far."""
+        return self._err.read_text()
+
+    def send(self, number):
+        """Send a signal."""
+        self.popen.send_signal(number)
+
+    def end(self, number=None, seconds=2 * DEADLINE_S):
+        """Wait for the end, after a signal if one is given, and return the exit code."""
+        self.awaited = True
+        if self.popen.poll() is None:
+            self._shared_memory.note(self.popen.pid)
+            if number is not None:
+                self.popen.send_signal(signal.SIGCONT)
+                self.popen.send_signal(number)
+        return self.popen.wait(seconds)
+
+    def kill(self):
+        """Kill it."""
+        self.awaited = True
+        self._shared_memory.note(self.popen.pid)
+        self._shared_memory.spoiled = True
+        self.popen.kill()
+        self.popen.wait()
+
+    def check_clean(self):
+        """Fail unless it ended as asked and without an outcry."""
+        assert (self.name, self.popen.returncode) == (self.name, 0), self.stderr
+        for word in ('Traceback', 'FATAL', 'Error', 'terminate called'):
+            assert word not in self.stdout + self.stderr
+
+
+def shared_memory_of(pid):
+    """Return the shared-memory files that a process owns: it keeps their lock files open."""
+    names = set()
+    for link in Path(f'/proc/{pid}/fd').iterdir():
+        with suppress(OSError):     # closed in the meantime
+            target = Path(os.readlink(link))
+            if target.parent == Path('/dev/shm') and target.name.endswith('_el'):
+                names.add(target.name[:-len('_el')])
+    return {Path('/dev/shm', form.format(name)) for name in names
+            for form in ('{}', '{}_el', 'sem.{}_mutex')}
+
+
+class SharedMemory:
+    """
+    What the middleware keeps in /dev/shm for the processes of a module.
+
+    :ivar seen: files that they were seen to own.
+    :ivar spoiled: whether one was killed, after which what it shared with others stays for ever.
+    """
+
+    def __init__(self):
+        self.seen = set()
+        self.spoiled = False
+
+    def note(self, pid):
+        """Remember what a process owns now."""
+        with suppress(OSError):     # it ended by itself
+            self.seen |= shared_memory_of(pid)
+
+    def left(self):
+        """Return the files that exist although no running process owns them."""
+        left = {path for path in self.seen if path.exists()}
+        for folder in Path('/proc').glob('[0-9]*') if left else ():
+            with suppress(OSError):     # it ended, or is another user's
+                left -= shared_memory_of(folder.name)
+        return left
+
+    def check(self):
+        """Fail if anything is left, once all have ended; after a kill remove it instead."""
+        if self.spoiled:
+            for path in self.left():
+                path.unlink(missing_ok=True)
+        # Ports from 7000 on are common to all domains: somebody else may hold them.
+        assert [path for path in self.left() if 'port70' not in path.name] == []
+
+
+class Suite:
+    """
+    Processes of one test or module, all of which end with it.
+
+    :param folder: for what they print.
+    :param shared_memory: takes note of what they own.
+    :param nursery: where to fork those that need no interpreter of their own.
+    """
+
+    def __init__(self, folder, shared_memory, nursery):
+        self.folder = folder
+        self._shared_memory = shared_memory
+        self._nursery = nursery
+        self._started = []
+
+    def start(self, name, *arguments, fresh=False):
+        """
+        Start `fourbar NAME ARGUMENTS`.
+
+        :param fresh: as a user does, in an interpreter that has imported nothing: for tests of how
+            processes start and end.
+        """
+        folder = self.folder / f'{len(self._started)}_{name}'
+        folder.mkdir()
+        process = Process(
+            name, arguments, folder, self._shared_memory, None if fresh else self._nursery)
+        self._started.append(process)
+        return process
+
+    def node(self, name, parameters=None, namespace='', arguments=(), fresh=False):
+        """Start a node with parameters in a namespace; a plant waits long for commands."""
+        ros_args = ['--ros-args']
+        patience = ({'command_timeout': COMMAND_TIMEOUT_S}
+                    if name in ('plant', 'hardware', 'prototype_emulator') else {})
+        for key, value in {**patience, **(parameters or {})}.items():
+            ros_args += ['-p', f'{key}:={value}']
+        if namespace:
+            ros_args += ['-r', f'__ns:={namespace}']
+        ros_args += arguments
+        return self.start(name, *(ros_args if ros_args[1:] else ()), fresh=fresh)
+
+    @staticmethod
+    def bus():
+        """Return parameters of the nodes on a bus with which they find each other."""
+        return on_a_bus()
+
+    def device(self, device, parameters=None, namespace='', emulator=None):
+        """
+        Start a testbed of the bench scale, simulated or on a bus, and return its processes.
+
+        :param parameters: of the node with the topics.
+        :param emulator: parameters of the emulated links, where there are some.
+        """
+        given = {name: {'mechanism': 'prototype'} for name in DEVICES[device]}
+        if device == 'plant':
+            given['plant']['table'] = 'prototype'
+        else:
+            for name, values in on_a_bus().items():
+                given[name].update(values)
+            given['prototype_emulator'].update(emulator or {})
+        given[device].update(parameters or {})
+        return {name: self.node(name, given[name], namespace) for name in DEVICES[device]}
+
+    def nodes(self, namespace='', fresh=False, **parameters):
+        """Start plant, estimator and controller; parameters by the name of the node."""
+        return {name: self.node(name, parameters.get(name), namespace, fresh=fresh)
+                for name in ('plant', 'estimator', 'controller')}
+
+    def close(self):
+        """Stop the nodes that still run and check that all ended cleanly."""
+        # Those that were waited for are their tests' own business.
+        unwatched = [process for process in self._started if not process.awaited]
+        try:
+            for process in sorted(unwatched, key=lambda one: STOP_ORDER.index(one.name)):
+                process.end(signal.SIGINT)
+            for process in unwatched:
+                process.check_clean()
+        finally:
+            for process in self._started:
+                if process.popen.poll() is None:
+                    process.kill()
+
+
+class Probe:
+    """
+    A node of the tests: it listens, asks, drives wheels, and waits for conditions.
+
+    :ivar received: list of messages by the topic's relative name, see `follow`.
+    """
+
+    def __init__(self, domain, namespace=''):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=domain,
+                   signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node('probe', context=self.context, namespace=namespace or None,
+                         enable_rosout=False, start_parameter_services=False)
+        self._executor = EventsExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self.received = {}
+        self._every_tick = {}
+        self._clients = {}
+        self._driving = None
+        self._torques = [0.0] * 4
+
+    def close(self):
+        """End ROS in this context."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+    def wait(self, condition, seconds=DEADLINE_S, instead=lambda: ''):
+        """
+        Run callbacks until a condition holds, and return what it returned.
+
+        :param instead: tells what is so if it does not.
+        """
+        end = time.monotonic() + seconds
+        while not (result := condition()):
+            assert time.monotonic() < end, f'it did not happen in time {instead()}'
+            self._executor.spin_once(timeout_sec=0.02)
+        return result
+
+    def catch_up(self):
+        """Handle everything that has arrived by now."""
+        # The executor serves in the order of arrival.
+        task = self._executor.create_task(lambda: None)
+        self.wait(task.done)
+
+    def follow(self, *topics, kind=JointState, qos=DEEP):
+        """Collect what comes on some topics, and return the list of (the last of) them."""
+        for topic in topics:
+            if topic not in self.received:
+                self.received[topic] = []
+                subscription = self.node.create_subscription(
+                    kind, topic, self.received[topic].append, qos)
+                if kind is JointState:
+                    self._every_tick[topic] = subscription
+        return self.received[topics[-1]]
+
+    def unfollow(self):
+        """
+        Follow no longer what comes every tick.
+
+        Two cores that run three nodes have no time to spare for messages that no test reads.
+        """
+        for topic, subscription in self._every_tick.items():
+            self.node.destroy_subscription(subscription)
+            del self.received[topic]
+        self._every_tick.clear()
+
+    def newest(self, topic):
+        """Follow a topic and return its newest message, after waiting for the first."""
+        messages = self.follow(topic)
+        return self.wait(lambda: messages)[-1]
+
+    def more(self, topic, count=1):
+        """Follow a topic, wait for more messages from now on, and return exactly so many."""
+        messages = self.follow(topic)
+        self.catch_up()
+        begin = len(messages)
+        self.wait(lambda: len(messages) >= begin + count)
+        return messages[begin:begin + count]
+
+    def status(self, topic, **wanted):
+        """Follow a latched status until it has some values, and return all of them."""
+        received = self.follow(topic, kind=DiagnosticStatus, qos=LATCHED)
+        self.catch_up()
+        self.wait(lambda: received and wanted.items() <= values_of(received[-1]).items(),
+                  instead=lambda: [values_of(message) for message in received[-3:]])
+        return values_of(received[-1])
+
+    def state(self):
+        """Return the newest state of the device, None before the first."""
+        received = self.follow('device_status', kind=DiagnosticStatus, qos=LATCHED)
+        return values_of(received[-1])['state'] if received else None
+
+    def diagnostics(self, node, condition=lambda status: True):
+        """Wait for a new status of a node on /diagnostics that fulfils a condition."""
+        arrays = self.follow('/diagnostics', kind=DiagnosticArray)
+        self.catch_up()
+        begin = len(arrays)
+
+        def found():
+            return next((status for array in arrays[begin:] for status in array.status
+                         if status.name == node and condition(status)), None)
+        return self.wait(found)
+
+    def counts(self, node, prefix, fresh=True):
+        """Return the counters of a node on /diagnostics whose names begin with a prefix."""
+        known = [status for array in self.received.get('/diagnostics', ())
+                 for status in array.status if status.name == node]
+        status = self.diagnostics(node) if fresh or not known else known[-1]
+        return {key[len(prefix):]: int(value) for key, value in values_of(status).items()
+                if key.startswith(prefix)}
+
+    def call(self, kind, service, request):
+        """
+        Call a service and return its response.
+
+        Every service keeps its client: a response to one that the server has not discovered yet
+        is lost, and a client is ready before that (ros2/rmw_fastrtps, issue 842). So until a
+        client has had its first answer, it asks again.
+        """
+        unknown = service not in self._clients
+        client = self._clients.get(service) or self.node.create_client(kind, service)
+        self.wait(client.service_is_ready)
+
+        def ask():
+            future, end = client.call_async(request), time.monotonic() + ASK_AGAIN_S
+            self.wait(lambda: future.done() or (unknown and time.monotonic() > end))
+            return future if future.done() else None
+        future = self.wait(ask)
+        self._clients[service] = client
+        return future.result()
+
+    def arm(self, wanted=True):
+        """Ask the device to arm or disarm."""
+        return self.call(SetBool, 'arm', SetBool.Request(data=wanted))
+
+    def trigger(self, service):
+        """Call a service without arguments."""
+        return self.call(Trigger, service, Trigger.Request())
+
+    def publisher(self, kind, topic, qos=COMMAND):
+        """Make a publisher and wait until somebody listens."""
+        publisher = self.node.create_publisher(kind, topic, qos)
+        self.wait(publisher.get_subscription_count)
+        return publisher
+
+    def drive(self, torques):
+        """Answer every tick with these torques [N m] from now on, None to stop answering."""
+        self._torques = torques
+        if self._driving is None:
+            self._driving = self.publisher(JointState, 'flywheel_command')
+            self.node.create_subscription(JointState, 'flywheel_states', self._answer, DEEP)
+            self.wait(lambda: self.node.count_publishers(
+                self.node.resolve_topic_name('flywheel_states')))
+
+    def command(self, stamp_ns, names=FLYWHEEL_NAMES, **fields):
+        """Send one wheel command."""
+        self._driving.publish(set_stamp(JointState(name=list(names), **fields), stamp_ns))
+
+    def _answer(self, tick):
+        if self._torques is not None:
+            self.command(stamp_of(tick), effort=self._torques)
+
+    def setpoint_verdict(self, message, publisher):
+        """Send a setpoint and return the values of controller_status after the verdict."""
+        before = self.status('controller_status')
+        publisher.publish(message)
+        received = self.received['controller_status']
+
+        def judged():
+            now = values_of(received[-1])
+            return now if any(now[key] != before[key] for key in ('accepted', 'refused')) else None
+        return self.wait(judged)
+
+
+@pytest.fixture(scope='session')
+def compiled():
+    """Compile the kernels before nodes have to answer in time."""
+    warm_up()
+
+
+@pytest.fixture(scope='session')
+def nursery(compiled):
+    """Fork processes that need no interpreter of their own."""
+    nursery = _nursery.Nursery()
+    yield nursery
+    nursery.close()
+
+
+@pytest.fixture(scope='module')
+def domain(compiled):
+    """Give the module a domain of its own, and its processes the environment for it."""
+    with claimed_domain() as number, pytest.MonkeyPatch.context() as patch:
+        patch.setenv('ROS_DOMAIN_ID', str(number))
+        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        patch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE',
+                     str(share_directory() / 'config' / 'fastdds_loopback.xml'))
+        yield number
+
+
+@pytest.fixture(scope='module')
+def shared_memory(domain):
+    """Check, when everything has ended, that it left nothing in /dev/shm."""
+    shared_memory = SharedMemory()
+    yield shared_memory
+    if shared_memory.spoiled:
+        spoiled_domains.add(domain)
+    shared_memory.check()
+
+
+@pytest.fixture(scope='module')
+def module_suite(shared_memory, nursery, tmp_path_factory):
+    """Run processes until the end of the module."""
+    suite = Suite(tmp_path_factory.mktemp('module'), shared_memory, nursery)
+    yield suite
+    suite.close()
+
+
+@pytest.fixture
+def suite(shared_memory, nursery, tmp_path):
+    """Run processes until the end of the test."""
+    suite = Suite(tmp_path, shared_memory, nursery)
+    yield suite
+    suite.close()
+
+
+@pytest.fixture(scope='module')
+def make_probe(domain, shared_memory):
+    """Return a function that makes a probe, closed at the end of the module; it has all probes."""
+    probes = []
+    # A full search for garbage in all that pytest has imported outlasts a command timeout.
+    gc.collect()
+    gc.freeze()
+
+    def make(namespace=''):
+        probes.append(Probe(domain, namespace))
+        return probes[-1]
+    make.probes = probes
+    yield make
+    shared_memory.note(os.getpid())
+    for probe in probes:
+        probe.close()
+
+
+@pytest.fixture(scope='module')
+def probe(make_probe):
+    """Watch the module's nodes."""
+    return make_probe()

@@ -1,0 +1,158 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Every node ends when it is asked to: quickly, silently, and with the wheels let go."""
+
+from itertools import product
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from sensor_msgs.msg import JointState
+
+pytestmark = pytest.mark.node
+
+# Two seconds, and what a busy machine takes.
+SHUTDOWN_S = 2.0 + 3.0
+SIGNALS = pytest.mark.parametrize(
+    'number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+
+
+@SIGNALS
+def test_moving_testbed_ends_cleanly(suite, make_probe, number):
+    """Controller, estimator, plant, in the middle of a move."""
+    namespace = f'/{number.name.lower()}'
+    nodes = suite.nodes(namespace, fresh=True)
+    probe = make_probe(namespace)
+    probe.follow('flywheel_command', 'sim/flywheel_states', 'flywheel_states')
+    probe.newest('flywheel_command')
+    probe.wait(lambda: probe.arm().success)
+    probe.status('controller_status', mode='hold')
+    probe.setpoint_verdict(JointState(name=['link_a'], position=[0.5]),
+                           probe.publisher(JointState, 'setpoint'))
+    probe.wait(lambda: any(probe.received['flywheel_command'][-1].effort))
+
+    assert nodes['controller'].end(number, SHUTDOWN_S) == 0
+    nodes['controller'].check_clean()
+    # What it said last: no torque.
+    probe.wait(lambda: not any(probe.received['flywheel_command'][-1].effort))
+    count = len(probe.received['flywheel_command'])
+    status = probe.status('device_status', state='disarmed')
+    assert 'no flywheel_command' in status['reason']
+    assert len(probe.received['flywheel_command']) == count
+
+    probe.drive([1e-5] * 4)
+    probe.wait(lambda: probe.arm().success)
+    nodes['plant'].send(number)
+    assert probe.status('device_status', state='disarmed')['reason'] == 'the node ends'
+    for name in ('plant', 'estimator'):
+        assert nodes[name].end(None if name == 'plant' else number, SHUTDOWN_S) == 0
+        nodes[name].check_clean()
+
+
+@pytest.fixture(scope='module')
+def alone(module_suite):
+    """Start nodes at once, each in a namespace of its own."""
+    return {namespace: module_suite.node(name, namespace=f'/{namespace}', fresh=True)
+            for namespace, name in (
+                ('alone_plant', 'plant'), ('alone_estimator', 'estimator'),
+                ('alone_controller', 'controller'), ('twice', 'controller'))}
+
+
+@pytest.mark.parametrize('name', ['plant', 'estimator', 'controller'])
+def test_node_alone_ends_as_soon_as_it_is_asked_to(alone, make_probe, name):
+    """Without anybody to talk to there is nothing to wait for."""
+    process = alone[f'alone_{name}']
+    probe = make_probe(f'/alone_{name}')
+    probe.diagnostics(f'alone_{name}/{name}')
+    assert process.end(signal.SIGINT, SHUTDOWN_S) == 0
+    process.check_clean()
+    assert process.stdout == '' or name == 'plant'
+
+
+def test_second_signal_does_no_harm(alone, make_probe):
+    process = alone['twice']
+    make_probe('/twice').diagnostics('twice/controller')
+    for _ in range(3):
+        process.send(signal.SIGINT)
+    assert process.end(seconds=SHUTDOWN_S) == 0
+    process.check_clean()
+
+
+def test_signal_during_the_start_is_no_outcry(suite, make_probe):
+    """It ends, whether or not it was ready, and never with a traceback of ours."""
+    process = suite.node('plant', namespace='/early', fresh=True)
+    make_probe().wait(lambda: process.stderr)
+    process.send(signal.SIGINT)
+    assert process.end(seconds=SHUTDOWN_S) == 0
+    process.check_clean()
+
+
+# Runs a command, and tells which threads the middleware has when ROS has ended.
+WATCHED = """
+import os, sys
+from fourbar_ros.ros import runtime
+from fourbar_ros.cli.main import main
+end = runtime.Runtime.shut_down
+def shut_down(self, *args):
+    end(self, *args)
+    names = [open(f'/proc/self/task/{task}/comm').read().strip()
+             for task in os.listdir('/proc/self/task')]
+    print('threads', *(name for name in names if name.startswith('dds.')), flush=True)
+runtime.Runtime.shut_down = shut_down
+sys.exit(main())
+"""
+
+
+NAMES = ('plant', 'estimator', 'controller', 'record')
+
+
+@pytest.fixture(scope='module')
+def watched(domain, shared_memory, tmp_path_factory):
+    """
+    Run commands, all at once, until the middleware has made its threads, and stop them then.
+
+    :returns: what they printed by name and whether they follow simulated time.
+    """
+    started = {}
+    for number, (name, sim_time) in enumerate(product(NAMES, (False, True))):
+        arguments = ['--ros-args', '-r', f'__ns:=/watched_{number}',
+                     '-p', f'use_sim_time:={str(sim_time).lower()}']
+        if name == 'record':
+            arguments = ['-o', 'bag']
+        started[name, sim_time] = subprocess.Popen(
+            [sys.executable, '-c', WATCHED, name, *arguments],
+            cwd=tmp_path_factory.mktemp('watched'),
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    printed = {}
+    try:
+        for process in started.values():
+            # The middleware makes its threads before the node takes signals.
+            deadline = time.monotonic() + 20.0
+            threads = Path(f'/proc/{process.pid}/task')
+            while b'dds.' not in b''.join(
+                    path.read_bytes() for path in threads.glob('*/comm')):
+                assert process.poll() is None
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+            shared_memory.note(process.pid)
+            process.send_signal(signal.SIGINT)
+        for key, process in started.items():
+            printed[key], _ = process.communicate(timeout=20.0)
+    finally:
+        for process in started.values():
+            process.kill()
+            process.communicate()
+    return printed
+
+
+@pytest.mark.parametrize('sim_time', [False, True], ids=['', 'sim_time'])
+@pytest.mark.parametrize('name', NAMES)
+def test_nothing_of_the_middleware_is_left_to_the_end_of_the_process(watched, name, sim_time):
+    """There it waits for its own callbacks, now and then for ever, at full speed."""
+    line, = [line for line in watched[name, sim_time].splitlines() if line.startswith('threads')]
+    # This one belongs to the process.
+    assert set(line.split()[1:]) <= {'dds.shm.wdog'}

@@ -1,0 +1,24 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The study of the bus, for two seconds."""
+
+from fourbar_ros.studies import bus
+import pytest
+
+pytestmark = pytest.mark.node
+
+
+def test_nothing_is_lost_in_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever it takes: how long that is depends on the machine, and is what the study tells."""
+    monkeypatch.setattr(bus, 'ANSWER_TIMEOUT_S', 5.0)
+    result = bus.run(lambda items, _: items, seconds=2)
+    assert result.data['ticks'] == 500
+    # Heartbeats and clocks come beside twelve frames a tick; a sample in a hundred is left out.
+    assert result.data['frames_received'] > 0.97 * 12 * 500
+    assert result.data['frames_sent'] == 5 * 500 + 1
+    for kind in ('lost_angles', 'lost_heartbeats', 'replayed', 'wrong_time',
+                 'commands_lost_commands', 'commands_replayed', 'lost_answers'):
+        assert result.data[kind] == 0, kind
+    assert 0.0 < result.data['round_trip_p50_ms'] < result.data['round_trip_max_ms']
+    assert result.files['bus.png'].startswith(b'\x89PNG')

@@ -1,0 +1,314 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The study of crossings: what it draws, what passes, and what it makes of the runs."""
+
+from collections.abc import Callable, Iterable
+import csv
+from dataclasses import replace
+from functools import partial
+from io import BytesIO, StringIO
+import json
+from math import inf, isfinite, nan, radians
+from types import SimpleNamespace
+from typing import Any
+
+from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.loop import load_scenario, Scenario
+from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.studies import crossing, crossing_runs, load_study, Result, Sample
+from fourbar_ros.studies.crossing import CROSSINGS, SAID, Tally
+from fourbar_ros.studies.crossing_runs import (
+    FRICTION_SPREAD,
+    go,
+    INERTIA_SPREAD,
+    METHODS,
+    Passage,
+    Run,
+    scenario_of,
+)
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+SEEDS = range(40)
+# Parks for 5 s, and no more: the rest of the manoeuvre is as long again.
+PARKING = replace(CROSSINGS['parking'], script=CROSSINGS['parking'].script[:1], duration=9.5)
+
+
+def passage(passed: bool) -> Passage:
+    """Make up what came of a run."""
+    theta = np.linspace(0.5, -0.5, 20)
+    eta = 1e-3 * np.cos(theta) if passed else 4.0 * theta
+    return Passage(passed, 2e-3 if passed else inf, float(np.abs(eta).max()), 0.01,
+                   '' if passed else 'elsewhere', np.column_stack([theta, eta]))
+
+
+# The confidence
+
+@pytest.mark.parametrize(('passed', 'runs', 'low', 'high'), [
+    (0, 10, 0.0, 0.3085), (1, 10, 0.0025, 0.4450), (5, 10, 0.1871, 0.8129),
+    (10, 10, 0.6915, 1.0), (100, 100, 0.9638, 1.0)])
+def test_interval_is_that_of_the_tables(passed: int, runs: int, low: float, high: float) -> None:
+    """Of Clopper and Pearson, as textbooks print it to four digits."""
+    tally = Tally([passage(number < passed) for number in range(runs)])
+    assert (tally.passed, tally.runs) == (passed, runs)
+    assert tally.interval == pytest.approx((low, high), abs=5e-5)
+
+
+@pytest.mark.parametrize(('passed', 'runs'), [(0, 300), (1, 3), (297, 300), (300, 300)])
+def test_interval_leaves_a_fortieth_on_either_side(passed: int, runs: int) -> None:
+    """At its ends what was found, or anything farther off, has a chance of 2.5 %."""
+    low, high = Tally([passage(number < passed) for number in range(runs)]).interval
+    assert low <= passed / runs <= high
+    if passed > 0:
+        assert binom.sf(passed - 1, runs, low) == pytest.approx(0.025)
+    if passed < runs:
+        assert binom.cdf(passed, runs, high) == pytest.approx(0.025)
+
+
+# What is drawn
+
+def drawn(scenario: Scenario) -> tuple[float, ...]:
+    """Return all numbers that a run draws."""
+    mechanism, table = scenario.mechanism, scenario.table
+    return (*mechanism.flywheel_inertias, *mechanism.link_lengths, table.joints.coulomb,
+            table.wheel_bearings.coulomb, scenario.initial.link_a, scenario.seed)
+
+
+@pytest.mark.parametrize('name', list(CROSSINGS))
+def test_every_method_gets_the_same_draws(name: str) -> None:
+    for seed in range(3):
+        scenarios = [scenario_of(Run(CROSSINGS[name], method, seed)) for method in METHODS]
+        assert len({drawn(scenario) for scenario in scenarios}) == 1
+        assert len({scenario.setpoints for scenario in scenarios}) == 1
+        assert [scenario.controller.allocation == 'two_wheels' for scenario in scenarios] == [
+            method == 'two' for method in METHODS]
+        assert [scenario.controller.branch_bandwidth > 0.0 for scenario in scenarios] == [
+            method == 'four_held' for method in METHODS]
+        base = scenarios[0].controller
+        assert {replace(scenario.controller, allocation=base.allocation,
+                        branch_bandwidth=base.branch_bandwidth) for scenario in scenarios} == {
+            base}
+
+
+def test_every_seed_draws_something_else_within_its_spread() -> None:
+    """Seeds 0 to 39: that one of four links and two signs never comes has a chance of 4 %."""
+    base = load_scenario('prototype')
+    hard = CROSSINGS['mismatch']
+    scenarios = [scenario_of(Run(hard, 'four', seed)) for seed in SEEDS]
+    for place, numbers in enumerate(zip(*(drawn(scenario) for scenario in scenarios))):
+        # All but the lengths, of which there are eight.
+        if not 4 <= place < 8:
+            assert len(set(numbers)) == len(SEEDS)
+    longer = set()
+    for scenario in scenarios:
+        mechanism = scenario.mechanism
+        wheels = mechanism.flywheel_inertias / base.mechanism.flywheel_inertias - 1.0
+        assert np.abs(wheels).max() <= INERTIA_SPREAD
+        for found, known in ((scenario.table.joints, base.table.joints),
+                             (scenario.table.wheel_bearings, base.table.wheel_bearings)):
+            assert abs(found.coulomb / known.coulomb - 1.0) <= FRICTION_SPREAD + 1e-12
+        lengths = mechanism.link_lengths / base.mechanism.link_lengths - 1.0
+        link = int(np.argmax(np.abs(lengths)))
+        assert abs(lengths[link]) == pytest.approx(hard.mismatch)
+        assert np.count_nonzero(lengths) == 1
+        longer.add((link, lengths[link] > 0.0))
+        # The controller knows that joints give, and not what was drawn.
+        believed = scenario.believed
+        np.testing.assert_array_equal(believed.link_lengths, base.mechanism.link_lengths)
+        np.testing.assert_array_equal(believed.flywheel_inertias, base.mechanism.flywheel_inertias)
+        np.testing.assert_array_equal(believed.joint_stiffness, [hard.stiffness] * 4)
+        np.testing.assert_array_equal(mechanism.joint_stiffness, [hard.stiffness] * 4)
+    assert len(longer) == 8
+
+
+def test_script_turns_with_the_heading() -> None:
+    scenario = scenario_of(Run(CROSSINGS['parking'], 'four', 0))
+    heading = scenario.initial.link_a
+    assert scenario.initial.link_b - heading == pytest.approx(CROSSINGS['parking'].theta)
+    for setpoint, (at, phi_a, phi_b, duration) in zip(
+            scenario.setpoints, CROSSINGS['parking'].script, strict=True):
+        assert (setpoint.at, setpoint.duration) == (at, duration)
+        assert [angle - heading for angle in setpoint.positions] == pytest.approx([phi_a, phi_b])
+
+
+# What passes
+
+@pytest.mark.parametrize('method', METHODS)
+def test_crossing_in_motion_needs_no_help(method: str) -> None:
+    found = go(Run(CROSSINGS['motion'], method, 0))
+    assert (found.passed, found.reason) == (True, '')
+    assert found.error < crossing_runs.NEAR_GOAL
+    # From one side of the change point to the other, on the branch of the parallelogram.
+    theta, eta = found.path.T
+    assert theta[0] == pytest.approx(radians(40.0))
+    assert theta[-1] == pytest.approx(radians(-40.0), abs=crossing_runs.NEAR_GOAL)
+    assert np.abs(eta).max() < 1e-9
+
+
+def test_four_wheels_park_where_two_are_thrown_off() -> None:
+    held = go(Run(PARKING, 'four_held', 0))
+    assert (held.passed, held.reason) == (True, '')
+    for seed in range(3):
+        found = go(Run(PARKING, 'two', seed))
+        assert not found.passed, f'seed {seed}'
+        assert found.reason == 'elsewhere', f'seed {seed}'
+        # Opposite links turn apart by far more than joints of 1e4 N/m let them.
+        assert found.apart > 10.0 * held.apart, f'seed {seed}'
+
+
+def test_run_that_is_refused_has_failed_and_says_why() -> None:
+    """80 degrees in a tenth of a second are too much for any motor."""
+    at, phi_a, phi_b, _ = CROSSINGS['motion'].script[0]
+    found = go(Run(replace(CROSSINGS['motion'], script=((at, phi_a, phi_b, 0.1),)), 'four', 0))
+    assert not found.passed
+    assert found.reason.startswith('setpoints, entry 1 at 0.5 s, refused: needs ')
+    # It stayed where it was: at the setpoint, and not at its goal.
+    assert found.error == pytest.approx(radians(80.0), abs=crossing_runs.NEAR_GOAL)
+
+
+Went = Callable[[Scenario, Any], Iterable[Any]]
+
+
+@pytest.fixture
+def went(monkeypatch: pytest.MonkeyPatch) -> Callable[[Went], Passage]:
+    """Return a function that makes up how a crossing in motion goes, and what came of it."""
+    def make(run_scenario: Went) -> Passage:
+        monkeypatch.setattr(crossing_runs, 'run_scenario', run_scenario)
+        return go(Run(CROSSINGS['motion'], 'four', 0))
+    return make
+
+
+def at(angles: Array) -> Any:
+    """Make a step at which the links are there."""
+    return SimpleNamespace(samples=SimpleNamespace(truth=SimpleNamespace(
+        link_angles=angles, efforts=np.zeros(4))))
+
+
+def goal_of(scenario: Scenario) -> Array:
+    return np.tile(scenario.setpoints[-1].positions, 2)
+
+
+def test_end_counts_and_a_whole_turn_does_not(went: Callable[[Went], Passage]) -> None:
+    def turned(scenario: Scenario, loop: Any) -> Iterable[Any]:
+        loop.testbed.gate.arm(0, ())
+        return [at(goal_of(scenario) + 2.0 * np.pi + 0.9 * crossing_runs.NEAR_GOAL)]
+    found = went(turned)
+    assert found.error == pytest.approx(0.9 * crossing_runs.NEAR_GOAL)
+    assert (found.passed, found.reason) == (True, '')
+
+
+@pytest.mark.parametrize(('off', 'armed', 'reason'), [
+    ([1.1, 0.0, 0.0, 0.0], True, 'elsewhere'), ([0.0, 0.0, -1.1, 0.0], True, 'elsewhere'),
+    ([nan] * 4, True, 'elsewhere'), ([0.0] * 4, False, 'not armed since start')])
+def test_end_that_is_none(
+    off: list[float], armed: bool, reason: str, went: Callable[[Went], Passage],
+) -> None:
+    """Of NEAR_GOAL; not a number is nowhere near."""
+    def ended(scenario: Scenario, loop: Any) -> Iterable[Any]:
+        if armed:
+            loop.testbed.gate.arm(0, ())
+        return [at(goal_of(scenario) + crossing_runs.NEAR_GOAL * np.array(off))]
+    found = went(ended)
+    assert not found.passed
+    assert found.reason == reason
+
+
+def test_run_that_fails_before_its_first_tick(went: Callable[[Went], Passage]) -> None:
+    def failed(scenario: Scenario, loop: Any) -> Iterable[Any]:
+        raise FourbarError('the table is on fire')
+    found = went(failed)
+    assert (found.passed, found.reason) == (False, 'the table is on fire')
+    assert found.error == inf
+    assert found.path.shape == (0, 2)
+
+
+# What the study makes of the runs
+
+def studied(passes: Callable[[Run], bool], monkeypatch: pytest.MonkeyPatch, runs: int = 60, *,
+            drawn: bool = False) -> Result:
+    """Run the study on made-up passages; the figure takes two seconds."""
+    figure = pytest.importorskip('fourbar_ros.studies.crossing_figure')
+    monkeypatch.setattr(crossing, 'go', lambda run: passage(passes(run)))
+    if not drawn:
+        monkeypatch.setattr(figure, 'png', lambda counted, of_map: b'')
+    return crossing.run(lambda items, count: items, Sample(runs, 0, 1))
+
+
+def easy(run: Run) -> bool:
+    """Tell of each kind of run another share."""
+    if run.method == 'two':
+        return run.crossing.duration == CROSSINGS['motion'].duration and (
+            run.crossing.mismatch == 0.0)
+    return run.crossing.mismatch < 1e-3 or run.crossing.stiffness == 1e4 and run.seed % 2 == 0
+
+
+@pytest.mark.parametrize('passes', [easy, lambda run: False, lambda run: True],
+                         ids=['some', 'none', 'all'])
+def test_numbers_are_of_the_runs_that_they_name(
+    passes: Callable[[Run], bool], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    result = studied(passes, monkeypatch)
+    # Neither nan nor infinity anywhere.
+    document = json.loads(json.dumps(result.data, allow_nan=False))
+    rows = list(csv.DictReader(StringIO(str(result.files['crossing.csv']))))
+    assert len(rows) == len(CROSSINGS) * len(METHODS) + len(document['map']) == 9 + 48
+    for name, made in CROSSINGS.items():
+        for method in METHODS:
+            wanted = sum(passes(Run(made, method, seed)) for seed in range(60))
+            numbers = document['crossings'][name][method]
+            assert (numbers['passed'], numbers['runs']) == (wanted, 60)
+            assert numbers['passed_low'] <= wanted / 60.0 <= numbers['passed_high']
+            assert sum(numbers['reasons'].values()) == 60 - wanted
+            assert (numbers['largest_eta_deg_of_passed'] is None) == (wanted == 0)
+            row, = (row for row in rows if (row['kind'], row['method']) == (name, method))
+            assert (int(row['passed']), int(row['runs'])) == (wanted, 60)
+            assert f'{wanted} of 60' in ' '.join(result.text.split())
+        assert SAID[name] in result.text
+    cells = [row for row in rows if row['kind'] == 'map']
+    for cell, row in zip(document['map'], cells, strict=True):
+        stiffness = cell['stiffness_n_m'] if cell['stiffness_n_m'] is not None else inf
+        run = Run(replace(CROSSINGS['mismatch'], mismatch=cell['mismatch'], stiffness=stiffness),
+                  'four_held', 0)
+        wanted = sum(passes(replace(run, seed=seed)) for seed in range(2))
+        assert (cell['passed'], cell['runs']) == (wanted, 2)
+        assert (float(row['mismatch']), float(row['stiffness_n_m']), float(row['time_s']),
+                int(row['passed'])) == (cell['mismatch'], stiffness, cell['time_s'], wanted)
+    assert not any(cell in ('', 'nan') for row in rows for cell in row.values())
+
+
+@pytest.mark.parametrize(('lost', 'kept'), [(0, True), (3, True), (4, False), (300, False)])
+def test_one_run_in_a_hundred_may_fail_and_not_more(
+    lost: int, kept: bool, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of four wheels with feedback; what the others do is shown and not held to anything."""
+    result = studied(lambda run: run.method == 'four_held' and run.seed >= lost, monkeypatch, 300)
+    assert len(result.checks) == len(CROSSINGS)
+    assert [check.passed for check in result.checks] == [kept] * len(CROSSINGS)
+    assert all(isfinite(check.value) for check in result.checks)
+    assert len({check.name for check in result.checks}) == len(CROSSINGS)
+
+
+@pytest.mark.parametrize(('passes', 'runs'), [
+    (easy, 60), (lambda run: False, 1), (lambda run: True, 300)], ids=['some', 'none', 'all'])
+def test_figure_is_whole(
+    passes: Callable[[Run], bool], runs: int, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Something is drawn in the middle and nothing at the edge, where it would be cut off."""
+    image = pytest.importorskip('matplotlib.image')
+    result = studied(passes, monkeypatch, runs, drawn=True)
+    assert result.skipped == []
+    png = result.files['crossing.png']
+    assert isinstance(png, bytes)
+    pixels = image.imread(BytesIO(png))[..., :3]
+    assert pixels.std() > 0.05
+    for edge in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]):
+        assert edge.min() == 1.0
+
+
+def test_default_is_as_many_runs_as_the_limit_needs() -> None:
+    study = load_study('crossing')
+    assert isinstance(study, partial)
+    assert study.keywords['sample'].runs == 300
+    assert load_study('crossing', runs=2).keywords['sample'].runs == 2  # type: ignore[attr-defined]

@@ -1,0 +1,188 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The derivation by Kane's method: reference motions, conservation, prescribed wheels."""
+
+from dataclasses import replace
+import json
+from pathlib import Path
+from typing import Any
+
+from fourbar_ros.mechanism import assemble, Mechanism, reduced_form
+from fourbar_ros.mechanism.case import Case, load_case
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+
+pytest.importorskip('sympy')
+
+from fourbar_ros.studies.independent import kane  # noqa: E402
+
+Array = NDArray[np.float64]
+
+REFERENCE = Path(__file__).parents[2] / 'config' / 'reference'
+ZERO = np.zeros(4)
+FREE = np.zeros(4, dtype=bool)
+PRESCRIBED = np.ones(4, dtype=bool)
+
+
+def bodies(mechanism: Mechanism, angles: Array, rates: Array) -> tuple[Array, Array]:
+    """Return mass centres (4, 2) and their velocities, joint 1 at rest in the origin."""
+    def arm(link: int, x: float, y: float) -> tuple[Array, Array]:
+        c, s = np.cos(angles[link]), np.sin(angles[link])
+        at = np.array([c * x - s * y, s * x + c * y])
+        return at, rates[link] * np.array([-at[1], at[0]])
+
+    base = {2: arm(1, mechanism.link_lengths[1], 0.0), 3: arm(0, mechanism.link_lengths[0], 0.0)}
+    own = [arm(link, *mechanism.com_positions[link]) for link in range(4)]
+    nowhere = (np.zeros(2), np.zeros(2))
+    return (np.array([own[i][0] + base.get(i, nowhere)[0] for i in range(4)]),
+            np.array([own[i][1] + base.get(i, nowhere)[1] for i in range(4)]))
+
+
+def momentum_and_energy(mechanism: Mechanism, angles: Array, rates: Array, wheels: Array
+                        ) -> tuple[float, float]:
+    """Sum up body by body, about the mass centre of the whole."""
+    mass = mechanism.link_masses
+    at, velocity = bodies(mechanism, angles, rates)
+    at = at - mass @ at / mass.sum()
+    velocity = velocity - mass @ velocity / mass.sum()
+    momentum = (mechanism.link_inertias @ rates + mechanism.flywheel_inertias @ wheels
+                + mass @ (at[:, 0] * velocity[:, 1] - at[:, 1] * velocity[:, 0]))
+    energy = (mechanism.link_inertias @ rates**2 + mechanism.flywheel_inertias @ wheels**2
+              + mass @ (velocity**2).sum(axis=1)) / 2.0
+    return float(momentum), float(energy)
+
+
+def conserved(case: Case) -> tuple[Array, Array]:
+    """Return momentum and energy (n,) along the motion of a case."""
+    motion = kane.simulate(case)
+    along = [momentum_and_energy(case.mechanism, *state) for state in zip(
+        motion.link_angles, motion.link_rates, motion.flywheel_speeds_absolute)]
+    momentum, energy = np.array(along).T
+    return momentum, energy
+
+
+@pytest.fixture(scope='module')
+def moving(uneven: Mechanism) -> Case:
+    """Turn and deform a linkage with nothing equal to anything else, its wheels coasting."""
+    angles = assemble(uneven, 0.2, 1.3)
+    across = np.stack([-np.sin(angles), np.cos(angles)]) * uneven.link_lengths * [-1, 1, 1, -1]
+    rates = np.array([0.4, 0.1])
+    dependent = np.linalg.solve(across[:, 2:], -across[:, :2] @ rates)
+    return Case(
+        mechanism=uneven, link_angles=angles, link_rates=np.concatenate([rates, dependent]),
+        flywheel_speeds_absolute=np.array([20.0, -30.0, 5.0, 0.0]), amplitude=ZERO,
+        frequency_hz=np.array([0.4, 0.3, 0.2, 0.5]), phase=np.array([0.3, -0.5, 1.0, 2.0]),
+        times=np.linspace(0.0, 2.0, 21), prescribed=FREE)
+
+
+@pytest.mark.parametrize('name', [
+    'asymmetric', 'paper_all', 'paper_pair_ac', 'parallelogram_offset_spinning'])
+def test_reference_motions(name: str) -> None:
+    """The files hold ten digits or more behind the point."""
+    path = REFERENCE / f'{name}.json'
+    reference: dict[str, Any] = json.loads(path.read_text())
+    motion = kane.simulate(load_case(path))
+    np.testing.assert_array_equal(motion.times, reference['t'])
+    for values, expected in (
+            (motion.link_angles, 'link_angles'), (motion.link_rates, 'link_rates'),
+            (motion.flywheel_speeds_absolute, 'flywheel_speeds_absolute')):
+        np.testing.assert_allclose(values, reference[expected], rtol=1e-10, atol=1e-10)
+
+
+def test_wheels_without_torque_leave_momentum_and_energy(moving: Case) -> None:
+    momentum, energy = conserved(moving)
+    np.testing.assert_allclose(momentum, momentum[0], rtol=1e-11)
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-11)
+    speeds = kane.simulate(moving).flywheel_speeds_absolute
+    np.testing.assert_allclose(
+        speeds, np.broadcast_to(speeds[0], speeds.shape), rtol=0.0, atol=1e-10)
+
+
+def test_wheels_locked_to_their_links_leave_momentum_and_energy(moving: Case) -> None:
+    locked = replace(moving, prescribed=PRESCRIBED, flywheel_speeds_absolute=moving.link_rates)
+    momentum, energy = conserved(locked)
+    np.testing.assert_allclose(momentum, momentum[0], rtol=1e-11)
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-11)
+
+
+def test_mixed_wheels_keep_momentum_and_follow_their_laws(moving: Case) -> None:
+    """Wheels a and d by angle, b and c by torque: motors are inside, momentum does not care."""
+    prescribed = np.array([True, False, False, True])
+    mixed = replace(moving, amplitude=np.array([9.0, 3e-5, -2e-5, 6.0]), prescribed=prescribed)
+    motion = kane.simulate(mixed)
+    momentum, energy = conserved(mixed)
+    # Little is left of what links and wheels hold against each other.
+    scale = float((np.abs(motion.flywheel_speeds_absolute)
+                   @ moving.mechanism.flywheel_inertias).max())
+    np.testing.assert_allclose(momentum, momentum[0], rtol=0.0, atol=1e-11 * scale)
+    assert np.ptp(energy) > 0.1 * energy[0]
+
+    times = mixed.times[:, np.newaxis]
+    turn = 2.0 * np.pi * mixed.frequency_hz
+    relative = motion.flywheel_speeds_absolute - motion.link_rates
+    given = -turn * mixed.amplitude * np.sin(turn * times + mixed.phase)
+    np.testing.assert_allclose(relative[:, prescribed], given[:, prescribed], atol=1e-12)
+    # If d(omega_f)/dt = tau, whatever the link does.
+    gained = mixed.amplitude / turn * (np.sin(turn * times + mixed.phase) - np.sin(mixed.phase))
+    expected = mixed.flywheel_speeds_absolute + gained / moving.mechanism.flywheel_inertias
+    np.testing.assert_allclose(motion.flywheel_speeds_absolute[:, ~prescribed],
+                               expected[:, ~prescribed], rtol=0.0, atol=1e-10)
+
+
+def test_closure_stays(moving: Case) -> None:
+    motion = kane.simulate(replace(moving, amplitude=np.full(4, 3e-5)))
+    assert np.ptp(motion.link_angles, axis=0).min() > 0.1
+    assert motion.closure_error.max() < 1e-13
+    lengths = moving.mechanism.link_lengths * [-1, 1, 1, -1]
+    gap = np.hypot(np.cos(motion.link_angles) @ lengths, np.sin(motion.link_angles) @ lengths)
+    np.testing.assert_allclose(motion.closure_error, gap, rtol=0.0, atol=1e-15)
+
+
+def test_torque_that_holds_a_wheel_to_its_law_does_the_same(paper: Mechanism) -> None:
+    """
+    Wheels a and c of a rhombus at rest: prescribed, or with the torque which that takes.
+
+    The pair has inertia J = 2 I + m l^2 / 2, and J omega + 2 If (omega + dpsi/dt) = 0, so that
+    the torque is If d(omega + dpsi/dt)/dt = If (1 - k) d2psi/dt2 with k = 2 If / (J + 2 If).
+    """
+    wheel = float(paper.flywheel_inertias[0])
+    inertia = 2.0 * 2.2e-5 + 0.02 * 0.1**2 / 2.0
+    turn = 2.0 * np.pi * 0.25
+    case = Case(
+        mechanism=paper, link_angles=np.array([0.0, 1.0, 0.0, 1.0]), link_rates=ZERO,
+        flywheel_speeds_absolute=ZERO, amplitude=np.array([80.0, 0.0, 80.0, 0.0]),
+        frequency_hz=np.full(4, 0.25), phase=ZERO, times=np.linspace(0.0, 3.0, 31),
+        prescribed=PRESCRIBED)
+    torque = -wheel * inertia / (inertia + 2.0 * wheel) * turn**2 * case.amplitude
+    by_angle = kane.simulate(case)
+    by_torque = kane.simulate(replace(case, amplitude=torque, prescribed=FREE))
+    np.testing.assert_allclose(by_angle.link_angles, by_torque.link_angles, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        by_angle.flywheel_speeds_absolute, by_torque.flywheel_speeds_absolute, rtol=0, atol=1e-9)
+    assert np.ptp(by_angle.link_angles[:, 0]) > 0.5
+
+
+def test_start_on_a_change_point_is_refused_in_one_line(paper: Mechanism) -> None:
+    case = Case(
+        mechanism=paper, link_angles=ZERO, link_rates=np.array([0.5, -0.5, 0.5, -0.5]),
+        flywheel_speeds_absolute=ZERO, amplitude=ZERO, frequency_hz=ZERO, phase=ZERO,
+        times=np.linspace(0.0, 0.6, 7), prescribed=FREE)
+    with pytest.raises(kane.KaneError, match='links c and d lie on a line') as caught:
+        kane.simulate(case)
+    assert '\n' not in str(caught.value)
+
+
+def test_motion_into_a_line_of_links_ends(uneven: Mechanism) -> None:
+    """A kite whose links c and d meet a and b: the steps would shrink without end."""
+    kite = replace(uneven, link_lengths=np.array([0.1, 0.1, 0.12, 0.12]))
+    angles = assemble(kite, 0.0, 0.05)
+    rates = np.array([0.0, -1.0])
+    dependent = reduced_form(kite, angles, rates).gamma @ rates
+    case = Case(
+        mechanism=kite, link_angles=angles, link_rates=np.concatenate([rates, dependent]),
+        flywheel_speeds_absolute=ZERO, amplitude=ZERO, frequency_hz=ZERO, phase=ZERO,
+        times=np.linspace(0.0, 0.2, 5), prescribed=FREE)
+    with pytest.raises(kane.KaneError, match='lie on a line'):
+        kane.simulate(case)

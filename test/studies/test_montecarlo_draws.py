@@ -1,0 +1,335 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a campaign draws, where it puts it, and what it refuses before any run."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import exp, inf, log
+from pathlib import Path
+from typing import Any
+
+from fourbar_ros.common.config_files import presets
+from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.loop import load_scenario
+from fourbar_ros.loop.description import load_description
+from fourbar_ros.studies.campaigns.file import Campaign, campaign_from, load_campaign
+from fourbar_ros.studies.campaigns.names import names_of, place_of, value_at
+from fourbar_ros.studies.campaigns.processes import CampaignError
+import numpy as np
+import pytest
+from scipy.stats import kstest, lognorm, loguniform, norm, truncnorm, uniform
+import yaml
+
+RUNS = 2000
+# With this share of good samples a test fails; the seeds are fixed, so it does or it does not.
+CHANCE = 1e-3
+
+
+def campaign(vary: dict[str, Any], **others: Any) -> Campaign:
+    """Make a campaign of the prototype."""
+    return campaign_from({'scenario': 'prototype', 'vary': vary, **others}, Path())
+
+
+def draws(made: Campaign, column: str, runs: int = RUNS) -> np.ndarray:
+    """Return what is drawn for a column (runs,)."""
+    return np.array([made.drawn(run)[column] for run in range(runs)])
+
+
+@pytest.mark.parametrize(('given', 'law'), [
+    ({'uniform': [2.0, 3.0]}, uniform(2.0, 1.0)),
+    ({'normal': {'mean': -1.0, 'std': 0.5}}, norm(-1.0, 0.5)),
+    ({'normal': {'mean': 0.0, 'std': 1.0}, 'within': [-0.5, 2.0]}, truncnorm(-0.5, 2.0)),
+    ({'lognormal': {'median': 3.0, 'sigma': 0.4}}, lognorm(0.4, scale=3.0)),
+    ({'loguniform': [1e-4, 1e-1]}, loguniform(1e-4, 1e-1)),
+])
+def test_draws_are_distributed_as_they_are_called(given: dict[str, Any], law: Any) -> None:
+    """Kolmogorov and Smirnov against the law of that name."""
+    seed = 3
+    made = campaign({'initial.link_a': given}, seed=seed)
+    found = kstest(draws(made, 'initial.link_a'), law.cdf)
+    assert found.pvalue > CHANCE, f'seed {seed}'
+
+
+def test_choices_are_even_and_elements_and_parameters_independent() -> None:
+    seed = 4
+    made = campaign({
+        'controller.allocation': {'choice': ['bounded', 'min_norm', 'min_energy']},
+        'mechanism.flywheel_inertias': {'uniform': [0.9, 1.1], 'scale': True, 'each': True},
+        'table.joints.coulomb': {'uniform': [0.9, 1.1], 'scale': True}}, seed=seed)
+    chosen = draws(made, 'controller.allocation').tolist()
+    for choice in ('bounded', 'min_norm', 'min_energy'):
+        # Four standard deviations of a binomial share.
+        assert abs(chosen.count(choice) / RUNS - 1.0 / 3.0) < 4.0 * (2.0 / 9.0 / RUNS) ** 0.5
+    numbers = np.array([draws(made, name) for name, kind in made.columns.items()
+                        if kind is float])
+    apart = np.corrcoef(numbers) - np.eye(5)
+    assert np.abs(apart).max() < 4.0 / RUNS ** 0.5, f'seed {seed}'
+
+
+def test_a_run_does_not_depend_on_the_other_runs_or_parameters() -> None:
+    vary = {'table.joints.coulomb': {'uniform': [0.9, 1.1], 'scale': True},
+            'initial.link_a': {'uniform': [-0.1, 0.1]}}
+    made = campaign(vary, seed=7, runs=10)
+    more = campaign({'initial.rate_a': {'uniform': [0.0, 0.1]},
+                     **dict(reversed(vary.items()))}, seed=7, runs=1000)
+    for run in (0, 3, 9):
+        assert made.drawn(run).items() <= more.drawn(run).items()
+        assert made.seed_of(run) == more.seed_of(run)
+    others = [replace(made, seed=8).drawn(3), made.drawn(4)]
+    assert all(made.drawn(3)[name] != other[name] for other in others for name in vary)
+    assert len({made.seed_of(run) for run in range(1000)}) == 1000
+
+
+def test_what_is_drawn_enters_the_scenario() -> None:
+    """Scaled, added, replaced; elements on their own or all by the same."""
+    made = campaign({
+        'mechanism.flywheel_inertias': {'uniform': [0.9, 1.1], 'scale': True, 'each': True},
+        'mechanism.com_positions[2]': {'uniform': [0.0, 0.01], 'add': True, 'each': True},
+        'mechanism.link_masses': {'uniform': [0.9, 1.1], 'scale': True},
+        'table.joints.coulomb': {'uniform': [1e-4, 2e-4]},
+        'controller.allocation': {'choice': ['two_wheels']},
+        'setpoints[0].relative.link_b': {'uniform': [1.0, 1.2]},
+        'believed.motor_resistances.b': {'choice': [7.0]},
+        'duration': {'uniform': [5.0, 6.0]}})
+    nominal, drawn, found = load_scenario('prototype'), made.drawn(5), made.scenario(5)
+    for link in range(4):
+        assert found.mechanism.flywheel_inertias[link] == pytest.approx(
+            nominal.mechanism.flywheel_inertias[link]
+            * drawn[f'mechanism.flywheel_inertias[{link}]'], rel=1e-15)
+    moved = found.mechanism.com_positions - nominal.mechanism.com_positions
+    assert moved[2] == pytest.approx([drawn['mechanism.com_positions[2][0]'],
+                                      drawn['mechanism.com_positions[2][1]']], rel=1e-12)
+    assert not np.delete(moved, 2, axis=0).any()
+    assert found.mechanism.link_masses / nominal.mechanism.link_masses == pytest.approx(
+        [drawn['mechanism.link_masses']] * 4, rel=1e-15)
+    assert found.table.joints.coulomb == drawn['table.joints.coulomb']
+    assert found.controller.allocation == 'two_wheels'
+    assert found.setpoints[0].positions[1] == pytest.approx(
+        np.pi / 3.0 + drawn['setpoints[0].relative.link_b'], rel=1e-15)
+    assert found.duration == drawn['duration']
+    assert found.seed == made.seed_of(5)
+    assert found.believed.motor_resistances.tolist() == [1.0, 7.0, 1.0, 1.0]
+    # All else is nominal, what is believed above all.
+    assert (found.believed.flywheel_inertias == nominal.mechanism.flywheel_inertias).all()
+    assert found.mechanism.link_lengths.tolist() == nominal.mechanism.link_lengths.tolist()
+    assert found.estimator == nominal.estimator
+
+
+def test_believed_may_be_what_is_drawn() -> None:
+    vary = {'mechanism.link_masses': {'uniform': [0.5, 0.7]},
+            'believed.link_inertias': {'choice': [2.0], 'scale': True}}
+    found = campaign(vary, believed='drawn').scenario(1)
+    assert found.believed.link_masses.tolist() == found.mechanism.link_masses.tolist()
+    assert found.believed.link_inertias == pytest.approx(2.0 * found.mechanism.link_inertias)
+    apart = campaign(vary).scenario(1)
+    assert apart.believed.link_masses.tolist() != apart.mechanism.link_masses.tolist()
+
+
+def test_what_is_set_of_the_mechanism_is_believed_too() -> None:
+    """As by a scenario with that mechanism; what is set of `believed` comes after it."""
+    vary = {'mechanism.link_inertias': {'uniform': [0.9, 1.1], 'scale': True}}
+    masses = {'mechanism.link_masses': [0.5, 0.6, 0.7, 0.8]}
+    made = campaign(vary, set={'believed.link_masses.a': 0.4, **masses})
+    found = made.scenario(0)
+    assert found.mechanism.link_masses.tolist() == [0.5, 0.6, 0.7, 0.8]
+    assert found.believed.link_masses.tolist() == [0.4, 0.6, 0.7, 0.8]
+
+
+def test_scenario_that_says_what_is_believed_keeps_it(tmp_path: Path) -> None:
+    described = load_description('prototype')
+    described['believed']['link_masses'] = [0.4, 0.4, 0.4, 0.4]
+    (tmp_path / 'mine.yaml').write_text(yaml.safe_dump(described))
+    made = campaign_from({'scenario': 'mine.yaml', 'set': {'mechanism.link_masses.a': 0.7},
+                          'vary': {'initial.link_a': {'uniform': [0.0, 0.1]}}}, tmp_path)
+    found = made.scenario(0)
+    assert found.mechanism.link_masses.tolist() == [0.7, 0.6, 0.6, 0.6]
+    assert found.believed.link_masses.tolist() == [0.4, 0.4, 0.4, 0.4]
+
+
+def test_mechanism_may_be_set_by_its_name() -> None:
+    """Then its values have names like those of any other."""
+    made = campaign({'mechanism.link_masses.a': {'choice': [2.0], 'scale': True}},
+                    set={'mechanism': 'paper', 'table': 'ideal'})
+    found, nominal = made.scenario(0), load_scenario('paper').mechanism
+    assert found.mechanism.link_masses[0] == 2.0 * nominal.link_masses[0]
+    assert found.believed.link_masses.tolist() == nominal.link_masses.tolist()
+
+
+def test_grids_are_gone_through_once_each() -> None:
+    made = campaign({'controller.allocation': {'grid': ['bounded', 'min_norm']},
+                     'controller.bandwidth': {'grid': [2.0, 3.0, 4.0]},
+                     'initial.link_a': {'uniform': [0.0, 0.1]}})
+    assert made.runs == 6
+    cells = [(made.drawn(run)['controller.allocation'], made.drawn(run)['controller.bandwidth'])
+             for run in range(12)]
+    assert cells[:6] == [(allocation, bandwidth) for allocation in ('bounded', 'min_norm')
+                         for bandwidth in (2.0, 3.0, 4.0)]
+    assert cells[6:] == cells[:6]
+
+
+def test_what_is_set_is_the_nominal_value() -> None:
+    made = campaign({'table.joints.coulomb': {'choice': [2.0], 'scale': True}},
+                    set={'table.joints.coulomb': 1e-3, 'setpoints[0].duration': 4.0},
+                    duration=5.0)
+    found = made.scenario(0)
+    assert found.table.joints.coulomb == 2e-3
+    assert (found.duration, found.setpoints[0].duration) == (5.0, 4.0)
+
+
+def test_every_name_leads_to_its_value() -> None:
+    description = load_description('prototype')
+    names = names_of(description)
+    assert len(names) == len(set(names)) > 200
+    for name in names:
+        value_at(description, place_of(name, description, 'vary'))
+    assert {'mechanism.link_lengths', 'mechanism.link_lengths[3]', 'table.joints.coulomb',
+            'believed.com_positions[2][1]', 'setpoints[0].relative.link_b', 'plant.rate',
+            'estimator.angle_noise', 'duration', 'arm_at'} <= set(names)
+    assert place_of('mechanism.com_positions.c[1]', description, '') == (
+        'mechanism', 'com_positions', 2, 1)
+
+
+GOOD = {'uniform': [0.9, 1.1], 'scale': True}
+
+
+@pytest.mark.parametrize(('vary', 'told'), [
+    ({'mechanism.flywheel_inertia': GOOD}, "no parameter 'mechanism.flywheel_inertia', do you "
+                                           'mean mechanism.flywheel_inertias'),
+    ({'table.joint.coulomb': GOOD}, 'do you mean table.joints.coulomb'),
+    ({'mechanism.link_lengths[4]': GOOD}, "no parameter 'mechanism.link_lengths[4]'"),
+    ({'mechanism.link_lengths.e': GOOD}, "no parameter 'mechanism.link_lengths.e'"),
+    ({'mechanism.joint_damping.a': GOOD}, "no parameter 'mechanism.joint_damping.a'"),
+    ({'setpoints[1].at': GOOD}, 'do you mean setpoints[0].at'),
+    ({'seed': GOOD}, "no parameter 'seed'"),
+    ({'zzz': GOOD}, "no parameter 'zzz'"),
+    ({'table.joints': GOOD}, "'table.joints' is a section, name one of its values"),
+    ({'setpoints': GOOD}, "'setpoints' is a section"),
+    ({'initial.link_a': {'unifrom': [0, 1]}}, "no distribution 'unifrom', do you mean uniform or"),
+    ({'initial.link_a': {'uniform': [0, 1], 'normal': {}}}, 'needs one distribution'),
+    ({'initial.link_a': {'scale': True}}, 'needs one distribution'),
+    ({'initial.link_a': 3.0}, 'must be a distribution like'),
+    ({'initial.link_a': {'uniform': [1.0, 0.0]}}, '1 is more than 0'),
+    ({'initial.link_a': {'uniform': [0.0, inf]}}, 'must be a finite number, got inf'),
+    ({'initial.link_a': {'uniform': [0.0]}}, 'must be [low, high]'),
+    ({'initial.link_a': {'loguniform': [0.0, 1.0]}}, 'must be positive'),
+    ({'initial.link_a': {'normal': {'mean': 0.0}}}, 'must have mean and std'),
+    ({'initial.link_a': {'normal': {'mean': 0.0, 'std': -1.0}}}, 'std must not be negative'),
+    ({'initial.link_a': {'lognormal': {'median': 0.0, 'sigma': 1.0}}}, 'median must be positive'),
+    ({'initial.link_a': {'choice': []}}, 'must be a list of values'),
+    ({'initial.link_a': {**GOOD, 'add': True}}, 'scale and add exclude each other'),
+    ({'initial.link_a': {**GOOD, 'scale': 2.0}}, 'scale must be true or false'),
+    ({'initial.link_a': {**GOOD, 'each': True}}, 'each is for arrays'),
+    ({'initial.link_a': {**GOOD, 'within': [0, 1]}}, 'goes with normal and lognormal only'),
+    ({'controller.allocation': GOOD}, "scale needs a number, the nominal is 'bounded'"),
+    ({'controller.allocation': {'choice': ['bounded'], 'add': True}}, 'need numbers'),
+    ({'plant.rate': {'grid': [1.0], 'each': True}}, 'each is not for it'),
+    ({'mechanism.link_masses': GOOD, 'mechanism.link_masses.b': GOOD}, 'about the same'),
+])
+def test_bad_names_and_distributions_are_told_in_one_line(vary: dict[str, Any], told: str
+                                                          ) -> None:
+    with pytest.raises(CampaignError) as caught:
+        campaign(vary)
+    assert told in str(caught.value) and '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(('others', 'told'), [
+    ({'run': 3}, "unknown 'run', do you mean runs?"),
+    ({'runs': 0}, 'runs must be a whole number from 1'),
+    ({'seed': 1.5}, 'seed must be a whole number'),
+    ({'believed': 'true'}, 'believed must be nominal or drawn'),
+    ({'set': {'plant.rat': 1}}, "set: no parameter 'plant.rat', do you mean plant.rate"),
+    ({'set': 3}, 'set must be a section'),
+    ({'scenario': 3}, 'scenario must be the name'),
+    ({'scenario': 'protoype'}, "no scenario 'protoype'"),
+    ({'limits': {'tracking_rms': {'at_most': 1}}}, 'do you mean tracking_rms_rad'),
+    ({'limits': {'work_j': {'quantile': 1.5, 'at_most': 1}}}, 'must be from 0 to 1'),
+    ({'limits': {'work_j': {'quantile': 0.5}}}, 'must have at_most or at_least'),
+    ({'limits': {'work_j': {'at_most': inf}}}, 'must be a finite number'),
+    ({'limits': {'failure_rate': {'quantile': 0.5, 'at_most': 1}}}, 'must have at_most'),
+])
+def test_bad_keys_are_told_in_one_line(others: dict[str, Any], told: str) -> None:
+    with pytest.raises(FourbarError) as caught:
+        campaign({'initial.link_a': {'uniform': [0, 1]}}, **others)
+    assert told in str(caught.value) and '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(('vary', 'told'), [
+    # Far off at one end: found before anything that is drawn.
+    ({'table.joints.coulomb': {'uniform': [-1e-9, 1.0]}}, 'joints.coulomb must be finite and not'),
+    ({'controller.bandwidth': {'choice': [4.0, 21.0]}}, 'controller.bandwidth must be between'),
+    ({'controller.allocation': {'choice': ['bounded', 'best']}}, 'must be one of'),
+    ({'table.wheel_encoders.counts_per_turn': {'uniform': [10.0, 11.5]}}, 'a whole number'),
+    ({'mechanism.link_lengths.a': {'uniform': [0.3, 1.0]}}, 'link_lengths cannot close'),
+    ({'plant.rate': {'choice': [250.0, 333.0]}}, 'refused alone'),
+    # Found among the runs.
+    ({'table.joints.coulomb': {'normal': {'mean': 0.0, 'std': 1.0}}}, 'run 1 is refused|run 0 is'),
+])
+def test_values_that_the_scenario_refuses_are_told_before_any_run(vary: dict[str, Any], told: str
+                                                                  ) -> None:
+    made = campaign(vary, runs=20)
+    with pytest.raises(CampaignError, match=told) as caught:
+        made.check()
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(('law', 'bounds'), [
+    ({'normal': {'mean': 0.0, 'std': 1.0}}, [20.0, 21.0]),
+    ({'normal': {'mean': 0.0, 'std': 1.0}}, [-9.0, -3.1]),
+    ({'normal': {'mean': 0.0, 'std': 0.0}}, [0.1, 1.0]),
+    ({'lognormal': {'median': 1.0, 'sigma': 0.1}}, [-1.0, 0.0]),
+    ({'lognormal': {'median': 1.0, 'sigma': 0.1}}, [1.5, 9.0]),
+])
+def test_bounds_that_are_hardly_ever_met_are_told(law: dict[str, Any], bounds: list[float]
+                                                  ) -> None:
+    with pytest.raises(CampaignError, match=r'within: less than 0.1 % of the draws are between'):
+        campaign({'initial.link_a': {**law, 'within': bounds}})
+
+
+@pytest.mark.parametrize(('law', 'bounds'), [
+    ({'normal': {'mean': 0.0, 'std': 1.0}}, [3.05, 9.0]),
+    ({'normal': {'mean': 0.0, 'std': 0.0}}, [0.0, 1.0]),
+    ({'lognormal': {'median': 1.0, 'sigma': 0.1}}, [-1.0, 0.75]),
+])
+def test_rare_bounds_are_met_in_every_run(law: dict[str, Any], bounds: list[float]) -> None:
+    """A thousand draws do not always reach what one of a thousand does."""
+    made = campaign({'initial.link_a': {**law, 'within': bounds}}, runs=50)
+    found = draws(made, 'initial.link_a', 50)
+    assert ((bounds[0] <= found) & (found <= bounds[1])).all()
+
+
+@pytest.mark.parametrize('given', [
+    {'lognormal': {'median': 1.0, 'sigma': 1000.0}},
+    {'loguniform': [1.7976931348623157e308, 1.7976931348623157e308]},
+    {'uniform': [-1.7e308, 1.7e308], 'scale': True},
+])
+def test_draws_beyond_all_numbers_are_refused(given: dict[str, Any]) -> None:
+    made = campaign({'initial.link_a': given}, runs=20)
+    with pytest.raises(CampaignError, match=r'initial.link_a must be between') as caught:
+        made.check()
+    assert '\n' not in str(caught.value)
+
+
+def test_identity_is_what_the_numbers_depend_on(campaign_file: Callable[..., str]) -> None:
+    same = load_campaign(campaign_file())
+    for change in ({'runs': 50}, {'limits': {'work_j': {'at_most': 1.0}}}):
+        assert load_campaign(campaign_file(**change)).hash == same.hash
+    for change in ({'seed': 6}, {'duration': 0.31}, {'believed': 'drawn'}, {'scenario': 'paper'},
+                   {'vary': {'initial.link_a': {'uniform': [0.0, 0.1]}}}):
+        assert load_campaign(campaign_file(**change)).hash != same.hash
+    assert load_campaign(campaign_file(), seed=6).hash == load_campaign(
+        campaign_file(seed=6)).hash
+    assert replace(same, versions={**same.versions, 'numpy': '0'}).hash != same.hash
+
+
+@pytest.mark.parametrize('name', presets('campaign'))
+def test_presets_can_be_run(name: str) -> None:
+    made = replace(load_campaign(name), runs=50)
+    made.check()
+    assert made.limits
+
+
+def test_extremes_of_log_distributions_stay_inside() -> None:
+    """Rounding of exp and log leaves no draw beyond the ends by more than itself."""
+    made = campaign({'initial.link_a': {'loguniform': [0.1, 0.1]}})
+    assert draws(made, 'initial.link_a', 5) == pytest.approx([exp(log(0.1))] * 5, rel=1e-15)

@@ -1,0 +1,157 @@
+# Copyright 2026 The fourbar_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The validation study: the laws it checks by, what it lets pass, and what it goes without."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+import sys
+from typing import Any
+
+from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.case import CaseError, simulate
+from fourbar_ros.studies import engine_comparison as comparison
+from fourbar_ros.studies import validation
+from fourbar_ros.studies.engine_comparison import Comparison, Trial
+import numpy as np
+import pytest
+
+
+def no_progress(items: Iterable[Any], total: int) -> Iterable[Any]:
+    """Show nothing, but take all there is, and no more than was announced."""
+    found = list(items)
+    assert len(found) == total
+    return found
+
+
+@pytest.fixture(scope='module')
+def comparisons(paper: Mechanism) -> list[Comparison]:
+    """Run the paper's tests with ours alone, standing in for Kane's engine as well."""
+    found = []
+    for name, shape in validation.PAPER_TESTS.items():
+        trial = Trial(name, validation.paper_test(paper, np.array(shape)))
+        ours = simulate(trial.case, comparison.STEP)
+        found.append(Comparison(trial, ours, {'kane': ours.link_angles}))
+    return found
+
+
+def verdicts(comparisons: list[Comparison]) -> dict[str, bool]:
+    return {check.name: check.passed for check in validation.checks(comparisons)}
+
+
+def test_the_turn_by_hand_balances_the_wheels(paper: Mechanism) -> None:
+    """
+    Links and wheels of a pair hold no momentum together at any time.
+
+    Checked with the momentum of the whole, in which opposite wheels and links of the other pair
+    rest.
+    """
+    case = validation.paper_test(paper, np.array([1.0, 0.0, 1.0, 0.0]))
+    turn = validation.turn_by_momentum(case)
+    rate = np.gradient(turn, case.times, edge_order=2)
+    omega = 2.0 * np.pi * validation.FREQUENCY_HZ
+    wheel = rate - omega * validation.AMPLITUDE * np.sin(omega * case.times)
+    # Two links about their mass centres, and each pair carries half the mass of the other.
+    momentum = (2.0 * 2.2e-5 + 0.02 * 0.1**2 / 2.0) * rate + 2.0 * 3.4e-7 * wheel
+    # Central differences over 0.05 s leave (0.05 omega)^2 / 6 of the rate.
+    scale = 2.0 * 3.4e-7 * np.abs(wheel).max()
+    assert np.abs(momentum).max() < 1e-3 * scale
+    assert np.ptp(turn) == pytest.approx(0.94, abs=1e-3)
+
+
+def test_all_checks_pass(comparisons: list[Comparison]) -> None:
+    assert all(verdicts(comparisons).values())
+
+
+@pytest.mark.parametrize(('trial', 'links', 'missed'), [
+    ('paper_test_1', [0, 2], {'test 1, a and c beside momentum by hand'}),
+    ('paper_test_1', [1, 3], {'test 1, turn of b and d'}),
+    ('paper_test_2', [0, 1, 2, 3], {'test 2, all links beside momentum by hand'}),
+    ('paper_test_2', [0, 2], {'test 2, all links beside momentum by hand',
+                              'test 2, change of configuration'}),
+    ('paper_opposite', [3], {'opposite commands, turn of any link'}),
+])
+def test_a_motion_that_is_off_is_missed(
+    trial: str, links: list[int], missed: set[str], comparisons: list[Comparison],
+) -> None:
+    """Two nanoradians at one time, where a nanoradian is the limit; no joint opens by 1e-12 m."""
+    def off(one: Comparison) -> Comparison:
+        angles = one.ours.link_angles.copy()
+        angles[100, links] += 2e-9
+        return replace(one, ours=replace(one.ours, link_angles=angles))
+
+    changed = [off(one) if one.trial.name == trial else one for one in comparisons]
+    failed = {name for name, passed in verdicts(changed).items() if not passed}
+    assert failed - {'closure, widest gap'} == missed | {'kane, largest difference'}
+
+
+def test_momentum_from_nowhere_is_missed(comparisons: list[Comparison]) -> None:
+    one = comparisons[1]
+    speeds = one.ours.flywheel_speeds_absolute.copy()
+    speeds[50] *= 1.0 + 1e-8
+    changed = [replace(one, ours=replace(one.ours, flywheel_speeds_absolute=speeds))]
+    assert validation.momentum_drift(one) < 1e-12
+    assert validation.momentum_drift(changed[0]) > 1e-9
+
+
+def test_differences_are_over_all_links_and_times(comparisons: list[Comparison]) -> None:
+    one = comparisons[0]
+    angles = one.ours.link_angles.copy()
+    angles[7, 2] -= 3e-6
+    angles[9, 1] += 4e-6
+    other = replace(one, others={'kane': angles})
+    assert other.largest('kane') == pytest.approx(4e-6)
+    assert other.rms('kane') == pytest.approx(5e-6 / np.sqrt(angles.size))
+
+
+def test_step_of_mujoco_is_taken_out_of_its_motion(
+    comparisons: list[Comparison], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An engine that is off by the square of its step is exact when extrapolated."""
+    def engine(step: float) -> comparison.Engine:
+        return comparison.Engine('', lambda trial: (
+            simulate(trial.case, comparison.STEP).link_angles + step**2))
+
+    engines = {name: engine(step) for name, step in comparison.MUJOCO_STEPS.items()}
+    monkeypatch.setattr(comparison, 'engines', lambda: (engines, []))
+    trials = [one.trial for one in comparisons]
+    compared, rules, _ = comparison.compare(trials, no_progress)
+    assert list(rules) == [*engines, 'mujoco_extrapolated']
+    for one in compared:
+        assert one.largest('mujoco_1ms') == pytest.approx(1e-6)
+        assert one.largest('mujoco_extrapolated') < 1e-14
+
+
+@pytest.mark.parametrize(('library', 'engines', 'told'), [
+    ('sympy', {'reference', 'mujoco_1ms', 'mujoco_2ms'}, 'Kane'),
+    ('mujoco', {'reference', 'kane'}, 'MuJoCo'),
+])
+def test_engines_that_are_not_installed_are_told(
+    library: str, engines: set[str], told: str, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ('sympy', 'mujoco'):
+        pytest.importorskip(name)
+    monkeypatch.setitem(sys.modules, library, None)
+    found, skipped = comparison.engines()
+    assert set(found) == engines
+    assert [told in line and f'{library} is missing' in line for line in skipped] == [True]
+
+
+def test_goes_on_without_any_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    for library in ('sympy', 'mujoco', 'matplotlib'):
+        monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(
+        sys.modules, 'fourbar_ros.studies.validation_figure', raising=False)
+    result = validation.run(no_progress)
+    assert [line.split()[-3] for line in result.skipped] == ['sympy', 'mujoco', 'matplotlib']
+    assert set(result.files) == {'validation.csv'}
+    assert {check.name for check in result.checks} >= {
+        'reference, largest difference', 'opposite commands, turn of any link'}
+    assert all(check.passed for check in result.checks)
+    assert 'kane' not in result.text
+
+
+def test_missing_reference_motion_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(validation, 'REFERENCES', ('atlantis',))
+    with pytest.raises(CaseError, match='atlantis'):
+        validation.trials()
