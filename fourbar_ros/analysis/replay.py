@@ -204,7 +204,7 @@ def checked_values(values: Mapping[str, Any]) -> dict[str, Any]:
     rows = {row.name: row for row in PARAMETERS}
     if unknown := sorted(set(values) - set(rows)):
         raise ReplayError(f'unknown setting {", ".join(unknown)} (known are {", ".join(rows)})')
-    return {name: row.checked(values.get(name, row.default)) for name, row in rows.items()}
+    return {name: row.check(values.get(name, row.default)) for name, row in rows.items()}
 
 
 def find_namespace(stored: StoredBag, wanted: str | None = None) -> str:

@@ -8,7 +8,7 @@ The one finder of the package. It works in a pip install, in a colcon install wi
 --symlink-install, and in a bare checkout.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator
 import os
 from pathlib import Path
 import re
@@ -143,19 +143,3 @@ _Loader.add_implicit_resolver(
     'tag:yaml.org,2002:float',
     re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$'),
     list('-+.0123456789'))
-
-
-def check_keys(values: Mapping[str, Any], required: Collection[str], origin: str,
-               error: type[FourbarError], optional: Collection[str] = ()) -> None:
-    """
-    Refuse a mapping that lacks a key or has one that means nothing.
-
-    :param origin: where the values come from, for the message.
-    :param error: what to raise.
-    """
-    if missing := sorted(set(required) - set(values)):
-        raise error(f'{origin}: {", ".join(missing)} missing')
-    known = {*required, *optional}
-    if unknown := sorted(set(map(str, values)) - known):
-        raise error(
-            f'{origin}: unknown {", ".join(unknown)} (known are {", ".join(sorted(known))})')

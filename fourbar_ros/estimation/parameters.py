@@ -5,36 +5,36 @@
 
 from __future__ import annotations
 
-from fourbar_ros.common.settings import Parameter
+from fourbar_ros.common.settings import Setting
 from fourbar_ros.estimation.settings import EstimatorSettings
 
 _DEFAULTS = EstimatorSettings()
 
 SETTINGS = (
-    Parameter('angle_noise', _DEFAULTS.angle_noise, 'rad',
-              'standard deviation of a link-angle sample', limits=(1e-9, 1.0)),
-    Parameter('counts_per_turn', _DEFAULTS.counts_per_turn, '',
-              'resolution of the link-angle sensors, 0 for none', limits=(0, 2 ** 31)),
-    Parameter('gyro_noise', _DEFAULTS.gyro_noise, 'rad/s',
-              'standard deviation of a gyro sample, where gyros are fitted', limits=(1e-9, 100.0)),
-    Parameter('gyro_walk', _DEFAULTS.gyro_walk, 'rad/s/sqrt(s)',
-              'density of the random walk of the bias of a gyro', limits=(0.0, 10.0)),
-    Parameter('disturbance_torque', _DEFAULTS.disturbance_torque, 'N m/sqrt(Hz)',
-              'density of unknown torques on each link', limits=(0.0, 10.0)),
-    Parameter('disturbance_walk', _DEFAULTS.disturbance_walk, 'N m/sqrt(s)',
+    Setting('angle_noise', _DEFAULTS.angle_noise, 'rad',
+              'standard deviation of a link-angle sample', low=1e-9, high=1.0),
+    Setting('counts_per_turn', _DEFAULTS.counts_per_turn, '',
+              'resolution of the link-angle sensors, 0 for none', low=0, high=2 ** 31),
+    Setting('gyro_noise', _DEFAULTS.gyro_noise, 'rad/s',
+              'standard deviation of a gyro sample, where gyros are fitted', low=1e-9, high=100.0),
+    Setting('gyro_walk', _DEFAULTS.gyro_walk, 'rad/s/sqrt(s)',
+              'density of the random walk of the bias of a gyro', low=0.0, high=10.0),
+    Setting('disturbance_torque', _DEFAULTS.disturbance_torque, 'N m/sqrt(Hz)',
+              'density of unknown torques on each link', low=0.0, high=10.0),
+    Setting('disturbance_walk', _DEFAULTS.disturbance_walk, 'N m/sqrt(s)',
               'density of the random walk of the torques that stand for friction and drag',
-              limits=(0.0, 10.0)),
-    Parameter('closure_tolerance', _DEFAULTS.closure_tolerance, 'm',
+              low=0.0, high=10.0),
+    Setting('closure_tolerance', _DEFAULTS.closure_tolerance, 'm',
               'how far the loop fails to close with the lengths given, as a standard deviation',
-              limits=(0.0, 0.1)),
-    Parameter('gate_probability', _DEFAULTS.gate_probability, '',
+              low=0.0, high=0.1),
+    Setting('gate_probability', _DEFAULTS.gate_probability, '',
               'share of the samples of a healthy sensor that is used, 1 for no gate',
-              limits=(0.9, 1.0)),
+              low=0.9, high=1.0),
 )
 """The fields of `EstimatorSettings`."""
 
 PARAMETERS = (
-    Parameter('mechanism', 'paper', '', 'preset or path of a mechanism file'),
+    Setting('mechanism', 'paper', '', 'preset or path of a mechanism file'),
     *SETTINGS,
 )
 """All parameters of the node."""

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 import socket
 from typing import Any
 
-from fourbar_ros.common.settings import Parameter
+from fourbar_ros.common.settings import Setting
 from fourbar_ros.hardware.can_port import open_port, Port
 from fourbar_ros.hardware.messages import Codec
 from fourbar_ros.mechanism import Mechanism
@@ -18,18 +18,18 @@ from fourbar_ros.mechanism import Mechanism
 CODECS = ('prototype', 'odrive')
 
 
-def bus_parameters(interface: str, channel: str, options: str) -> tuple[Parameter, ...]:
+def bus_parameters(interface: str, channel: str, options: str) -> tuple[Setting, ...]:
     """List the parameters of a bus; the arguments are defaults."""
     return (
-        Parameter('bus.interface', interface, '', 'interface of python-can, as socketcan, slcan, '
+        Setting('bus.interface', interface, '', 'interface of python-can, as socketcan, slcan, '
                   'serial, udp_multicast, virtual or fourbar_udp'),
-        Parameter('bus.channel', channel, '', 'channel of the interface, as can0 or HOST:PORT'),
-        Parameter('bus.bitrate', 1_000_000, 'bit/s', 'of interfaces that have one',
-                  limits=(10_000, 1_000_000)),
-        Parameter('bus.options', options, '',
+        Setting('bus.channel', channel, '', 'channel of the interface, as can0 or HOST:PORT'),
+        Setting('bus.bitrate', 1_000_000, 'bit/s', 'of interfaces that have one',
+                  low=10_000, high=1_000_000),
+        Setting('bus.options', options, '',
                   'more for the interface, as key=value, with spaces between'),
-        Parameter('codec', 'prototype', '', 'what is spoken on the bus', choices=CODECS),
-        Parameter('dbc', 'prototype', '', 'preset or path of the DBC file of what is not of '
+        Setting('codec', 'prototype', '', 'what is spoken on the bus', choices=CODECS),
+        Setting('dbc', 'prototype', '', 'preset or path of the DBC file of what is not of '
                   'ODrive'),
     )
 

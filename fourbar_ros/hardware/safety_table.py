@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any
 
-from fourbar_ros.common.config_files import check_keys, config_file, load_yaml
+from fourbar_ros.common.config_files import config_file, load_yaml
 from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.settings import check_keys
 from fourbar_ros.device.interface import DeviceFault, Reaction
 
 

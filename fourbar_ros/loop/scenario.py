@@ -16,9 +16,9 @@ from math import floor
 from pathlib import Path
 from typing import Any, cast, TypeVar
 
-from fourbar_ros.common.config_files import check_keys, config_file, load_yaml
+from fourbar_ros.common.config_files import config_file, load_yaml
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.common.settings import Parameter
+from fourbar_ros.common.settings import check_keys, Setting
 from fourbar_ros.control import ControllerSettings
 from fourbar_ros.control.parameters import SETTINGS as CONTROLLER
 from fourbar_ros.device.supervisor import TIMEOUT_ACTIONS
@@ -149,7 +149,7 @@ class Scenario:
         }
 
 
-def _allowed(rows: Sequence[Parameter]) -> dict[str, Allowed]:
+def _allowed(rows: Sequence[Setting]) -> dict[str, Allowed]:
     """Return what the table of a node allows."""
     allowed: dict[str, Allowed] = {}
     for row in rows:

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field, fields, MISSING, replace
 from functools import cached_property
 from typing import Any
 
-from fourbar_ros.common.config_files import check_keys, config_file, load_yaml
+from fourbar_ros.common.config_files import config_file, load_yaml
 from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.settings import check_keys
 from fourbar_ros.mechanism.constants import Array, Constants, constants_of
 import numpy as np
 from numpy.typing import ArrayLike

@@ -21,7 +21,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from fourbar_ros.common.config_files import check_keys, load_yaml
+from fourbar_ros.common.config_files import load_yaml
+from fourbar_ros.common.settings import check_keys
 from fourbar_ros.plant.faults import Fault, fault_kinds, FaultError, parse_fault
 
 LATEST_S = 1e9

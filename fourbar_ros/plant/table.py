@@ -10,8 +10,9 @@ from dataclasses import dataclass, field, fields, MISSING
 from math import inf, isfinite, pi, sin
 from typing import Any
 
-from fourbar_ros.common.config_files import check_keys, config_file, load_yaml
+from fourbar_ros.common.config_files import config_file, load_yaml
 from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.settings import check_keys
 from fourbar_ros.mechanism.forces import Surroundings, surroundings
 from fourbar_ros.plant.sensors import LinkSensorSettings, SensorError
 

@@ -4,10 +4,8 @@
 """One table per node lists its parameters; declaring, checking and documents come from it."""
 
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.common.settings import Parameter, ParameterError
+from fourbar_ros.common.settings import SettingError
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
-
-__all__ = ['declare', 'Parameter', 'ParameterError']
 
 
 def declare(node, table, changed=None):
@@ -17,7 +15,7 @@ def declare(node, table, changed=None):
     :param changed: called with the dict of all values before they change at run time; what it
         raises refuses the change.
     :returns: dict of values by name.
-    :raises ParameterError: a value given at start is refused.
+    :raises SettingError: a value given at start is refused.
     """
     rows = {row.name: row for row in table}
     values = {}
@@ -25,15 +23,15 @@ def declare(node, table, changed=None):
         given = node.declare_parameter(row.name, row.default, ParameterDescriptor(
             description=f'{row.meaning} [{row.unit}]' if row.unit else row.meaning,
             read_only=not row.live, dynamic_typing=True)).value
-        values[row.name] = row.checked(given)
+        values[row.name] = row.check(given)
 
     def on_set(parameters):
         new = dict(values)
         for parameter in parameters:
             if parameter.name in rows:
                 try:
-                    new[parameter.name] = rows[parameter.name].checked(parameter.value)
-                except ParameterError as error:
+                    new[parameter.name] = rows[parameter.name].check(parameter.value)
+                except SettingError as error:
                     return SetParametersResult(successful=False, reason=str(error))
         if new != values:
             try:

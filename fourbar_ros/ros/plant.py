@@ -4,12 +4,12 @@
 """The simulated air table as a node."""
 
 from fourbar_ros.common.monotonic_clock import monotonic_ns
+from fourbar_ros.common.settings import Setting
 from fourbar_ros.device import Recovery
 from fourbar_ros.ros import device_node
 from fourbar_ros.ros.device_parameters import common_parameters
 from fourbar_ros.ros.ground_truth import GroundTruth
 from fourbar_ros.ros.paces import fast_pace, lockstep_pace, realtime_pace
-from fourbar_ros.ros.parameters import Parameter
 from fourbar_ros.ros.runtime import run_node
 from fourbar_ros.ros.sim_services import SimServices
 from fourbar_ros.ros.simulated_time import Lockstep, SimulatedClock
@@ -27,12 +27,12 @@ _TABLE = table_parameters('ideal')
 PARAMETERS = (
     *common_parameters('paper'),
     _TABLE[0],
-    Parameter('clock', 'realtime', '', 'what the ticks follow', choices=tuple(CLOCKS)),
-    Parameter('real_time_factor', 1.0, '', 'simulated seconds per second of the fast clock, 0 '
-              'for as fast as it can', limits=(0.0, 1000.0)),
-    Parameter('guard_timeout', 1.0, 's', 'lock-step tells for whom it waits after so long',
-              limits=(0.05, 3600.0)),
-    Parameter('start_paused', False, '', 'wait for sim/step or sim/pause before the first tick'),
+    Setting('clock', 'realtime', '', 'what the ticks follow', choices=tuple(CLOCKS)),
+    Setting('real_time_factor', 1.0, '', 'simulated seconds per second of the fast clock, 0 '
+              'for as fast as it can', low=0.0, high=1000.0),
+    Setting('guard_timeout', 1.0, 's', 'lock-step tells for whom it waits after so long',
+              low=0.05, high=3600.0),
+    Setting('start_paused', False, '', 'wait for sim/step or sim/pause before the first tick'),
     *_TABLE[1:],
 )
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import time
 
 from fourbar_ros.common.monotonic_clock import monotonic_ns
+from fourbar_ros.common.settings import Setting
 from fourbar_ros.hardware.bus_settings import bus_parameters, make_codec, open_bus
 from fourbar_ros.hardware.emulator import (
     BUS_TROUBLES,
@@ -20,7 +21,7 @@ from fourbar_ros.hardware.firmware import FirmwareSettings
 from fourbar_ros.hardware.poll_loop import attend
 from fourbar_ros.mechanism import LINK_NAMES
 from fourbar_ros.ros.ground_truth import GroundTruth
-from fourbar_ros.ros.parameters import declare, Parameter
+from fourbar_ros.ros.parameters import declare
 from fourbar_ros.ros.runtime import run_node
 from fourbar_ros.ros.table_parameters import apply_faults, make_table, table_parameters
 import numpy as np
@@ -29,21 +30,21 @@ from rclpy.node import Node
 LETTERS = 'abcd'
 
 PARAMETERS = (
-    Parameter('mechanism', 'prototype', '', 'preset or path of a mechanism file'),
+    Setting('mechanism', 'prototype', '', 'preset or path of a mechanism file'),
     *bus_parameters('fourbar_udp', '127.0.0.1:29537', 'peers=127.0.0.1:29536'),
-    Parameter('links', LETTERS, '', 'those that are there, by their letters'),
-    Parameter('rate', 1000.0, 'Hz', 'of the electronics', limits=(100.0, 2000.0)),
-    Parameter('truth_rate', 250.0, 'Hz', 'of the ground truth on sim/', limits=(1.0, 1000.0)),
-    Parameter('command_timeout', 0.1, 's', 'longest time without a command before a link coasts',
-              limits=(0.01, 10.0)),
-    Parameter('clock_offset', 100.0, 's', 'what the clocks of the links show at the start, beside '
-              'some seconds between them', limits=(0.0, 4000.0)),
-    Parameter('clock_drift', 30e-6, 's/s', 'by how much links a and b run fast and c and d slow',
-              limits=(0.0, 1e-3)),
+    Setting('links', LETTERS, '', 'those that are there, by their letters'),
+    Setting('rate', 1000.0, 'Hz', 'of the electronics', low=100.0, high=2000.0),
+    Setting('truth_rate', 250.0, 'Hz', 'of the ground truth on sim/', low=1.0, high=1000.0),
+    Setting('command_timeout', 0.1, 's', 'longest time without a command before a link coasts',
+              low=0.01, high=10.0),
+    Setting('clock_offset', 100.0, 's', 'what the clocks of the links show at the start, beside '
+              'some seconds between them', low=0.0, high=4000.0),
+    Setting('clock_drift', 30e-6, 's/s', 'by how much links a and b run fast and c and d slow',
+              low=0.0, high=1e-3),
     # The links stay where they are: nobody puts them back.
     *(replace(row, live=False) if row.name.startswith('initial.') else row
       for row in table_parameters('prototype')),
-    *(Parameter(f'trouble.{target}', '', '', f'{" or ".join(troubles)}', live=True)
+    *(Setting(f'trouble.{target}', '', '', f'{" or ".join(troubles)}', live=True)
       for target, troubles in (*((name, LINK_TROUBLES) for name in LINK_NAMES),
                                ('bus', BUS_TROUBLES))),
 )

@@ -5,12 +5,12 @@
 
 from math import pi
 
+from fourbar_ros.common.settings import Setting
 from fourbar_ros.device import SimulatedTable
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, load_mechanism, SENSOR_NAMES
 from fourbar_ros.mechanism.closure import BRANCHES
 from fourbar_ros.plant import InitialState, load_table, Plant
 from fourbar_ros.plant.fault_schedule import read_schedule
-from fourbar_ros.ros.parameters import Parameter
 import numpy as np
 
 
@@ -21,26 +21,26 @@ def table_parameters(table):
     :param table: default of that parameter.
     """
     return (
-        Parameter('table', table, '', 'preset or path of a table file'),
-        Parameter('step', 0.0005, 's', 'integration step; the period is a whole multiple of it',
-                  limits=(1e-6, 0.1)),
-        Parameter('seed', 0, '', 'of all random numbers', limits=(0, 2 ** 63 - 1)),
-        Parameter('fault_schedule', '', '', 'path of a YAML file of faults that come and go',
+        Setting('table', table, '', 'preset or path of a table file'),
+        Setting('step', 0.0005, 's', 'integration step; the period is a whole multiple of it',
+                  low=1e-6, high=0.1),
+        Setting('seed', 0, '', 'of all random numbers', low=0, high=2 ** 63 - 1),
+        Setting('fault_schedule', '', '', 'path of a YAML file of faults that come and go',
                   live=True),
-        *(Parameter(f'fault.{name}', '', '', 'what is wrong with it, as `off` or `wrong 0.1`',
+        *(Setting(f'fault.{name}', '', '', 'what is wrong with it, as `off` or `wrong 0.1`',
                     live=True) for name in SENSOR_NAMES),
-        *(Parameter(f'fault.{name}', '', '', 'what is wrong with it, as `dead` or `weak 0.5`',
+        *(Setting(f'fault.{name}', '', '', 'what is wrong with it, as `dead` or `weak 0.5`',
                     live=True) for name in FLYWHEEL_NAMES),
-        Parameter('initial.link_a', 0.0, 'rad', 'orientation of link a at start and reset',
-                  limits=(-1e6, 1e6), live=True),
-        Parameter('initial.link_b', round(pi / 3, 12), 'rad',
-                  'orientation of link b at start and reset', limits=(-1e6, 1e6), live=True),
-        Parameter('initial.branch', 'open', '', 'assembly at start and reset', choices=BRANCHES,
+        Setting('initial.link_a', 0.0, 'rad', 'orientation of link a at start and reset',
+                  low=-1e6, high=1e6, live=True),
+        Setting('initial.link_b', round(pi / 3, 12), 'rad',
+                  'orientation of link b at start and reset', low=-1e6, high=1e6, live=True),
+        Setting('initial.branch', 'open', '', 'assembly at start and reset', choices=BRANCHES,
                   live=True),
-        Parameter('initial.rate_a', 0.0, 'rad/s', 'rate of link a at start and reset',
-                  limits=(-100.0, 100.0), live=True),
-        Parameter('initial.rate_b', 0.0, 'rad/s', 'rate of link b at start and reset',
-                  limits=(-100.0, 100.0), live=True),
+        Setting('initial.rate_a', 0.0, 'rad/s', 'rate of link a at start and reset',
+                  low=-100.0, high=100.0, live=True),
+        Setting('initial.rate_b', 0.0, 'rad/s', 'rate of link b at start and reset',
+                  low=-100.0, high=100.0, live=True),
     )
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-from fourbar_ros.common.settings import Parameter
+from fourbar_ros.common.settings import Setting
 from fourbar_ros.control import Controller, ControllerSettings
 from fourbar_ros.control.parameters import PARAMETERS, SETTINGS
 from fourbar_ros.control.settings import WHEEL_TARGETS
@@ -23,7 +23,7 @@ def test_rows_are_the_fields_of_the_settings_in_order() -> None:
 
 
 @each_row
-def test_defaults_are_those_of_the_settings_and_are_allowed(row: Parameter) -> None:
+def test_defaults_are_those_of_the_settings_and_are_allowed(row: Setting) -> None:
     assert row.default == getattr(ControllerSettings(), row.name)
     assert (row.limits is None) != (row.choices is None)
     if row.limits is not None:
@@ -34,7 +34,7 @@ def test_defaults_are_those_of_the_settings_and_are_allowed(row: Parameter) -> N
 
 
 @each_row
-def test_everything_can_be_set_while_it_runs_and_says_what_it_is(row: Parameter) -> None:
+def test_everything_can_be_set_while_it_runs_and_says_what_it_is(row: Setting) -> None:
     assert row.live
     assert row.meaning
     assert not row.meaning.endswith('.')
@@ -44,7 +44,7 @@ def test_everything_can_be_set_while_it_runs_and_says_what_it_is(row: Parameter)
     (row, choice) for row in SETTINGS for choice in row.choices or ()],
     ids=[f'{row.name}-{choice}' for row in SETTINGS for choice in row.choices or ()])
 def test_every_choice_is_one_that_the_controller_takes(
-    row: Parameter, choice: str, prototype: Mechanism,
+    row: Setting, choice: str, prototype: Mechanism,
 ) -> None:
     controller = Controller(prototype, ControllerSettings())
     controller.tune(ControllerSettings(**{row.name: choice}))  # type: ignore[arg-type]
