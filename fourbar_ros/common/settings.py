@@ -64,12 +64,12 @@ class Setting:
     above: float = -inf
     choices: tuple[Any, ...] | None = None
     live: bool = False
-    kind: Any = MISSING
+    kind: Any = None
     infinite: bool = False
 
     def __post_init__(self) -> None:
         """Take the type from the default."""
-        if self.kind is MISSING:
+        if self.kind is None:
             object.__setattr__(self, 'kind', type(self.default))
 
     @property
