@@ -35,12 +35,12 @@ def run(args: argparse.Namespace) -> int:
     from fourbar_ros.benchmarks.mechanics import checks_of, measure, table
     from fourbar_ros.cli.progress import show_progress
     from fourbar_ros.common.checks import checks_as_json, print_checks
-    from fourbar_ros.common.output_files import write_whole
+    from fourbar_ros.common.output_files import atomic_file
     from fourbar_ros.kernels.compiler import announced
 
     with ExitStack() as stack:
         # Opened before the work: a file that cannot be written is no news for its end.
-        file = stack.enter_context(write_whole(args.json)) if args.json else None
+        file = stack.enter_context(atomic_file(args.json)) if args.json else None
         with announced():
             results = measure(args.repeats, show_progress)
         checks = checks_of(results)

@@ -19,10 +19,10 @@ from fourbar_ros.cli.ros import add_ros_arguments, testbed_client
 from fourbar_ros.cli.setpoint import parse_goal
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.output_files import (
+    atomic_folder,
     check_file,
     check_new_folder,
     OutputError,
-    whole_folder,
     write_files,
 )
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, load_mechanism, Mechanism
@@ -194,7 +194,7 @@ def _experiment(args: argparse.Namespace) -> Path:
             excitation = _excitation(args, load_mechanism(args.mechanism or name))
             with _progress(excitation.duration_s) as progress:
                 experiment.drive(excitation, progress)
-        with whole_folder(args.record) as folder:
+        with atomic_folder(args.record) as folder:
             experiment.write(folder)
     return Path(args.record)
 

@@ -18,7 +18,7 @@ from typing import Any, TYPE_CHECKING
 
 from fourbar_ros.cli.processes import Processes
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.common.output_files import OutputError, write_whole
+from fourbar_ros.common.output_files import atomic_file, OutputError
 import yaml
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ def _write_parameters(scenario: Scenario, device: str, path: Path) -> list[str]:
     if device == 'prototype':
         parameters.update(_on_a_bus(parameters.pop('plant')))
     parameters['controller']['setpoint_duration'] = _duration(scenario)
-    with write_whole(path) as file:
+    with atomic_file(path) as file:
         yaml.safe_dump({f'/**/{node}': {'ros__parameters': values}
                         for node, values in parameters.items()}, file, sort_keys=False)
     return ['--ros-args', '--params-file', str(path.absolute())]

@@ -15,10 +15,10 @@ from typing import Any
 from fourbar_ros.cli.progress import show_progress
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.output_files import (
+    atomic_file,
+    atomic_folder,
     check_new_folder,
     OutputError,
-    whole_folder,
-    write_whole,
 )
 
 EPILOG = """\
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json and not args.json.absolute().parent.is_dir():
         raise OutputError(f'cannot write {args.json}: no such folder')
 
-    with whole_folder(output) as folder:
+    with atomic_folder(output) as folder:
         with announced():
             from fourbar_ros.loop.warm_up import warm_up
             warm_up()
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
         (folder / 'comparison.json').write_text(text, encoding='utf-8')
         (folder / 'comparison.png').write_bytes(png(comparison))
         if args.json:
-            with write_whole(args.json) as file:
+            with atomic_file(args.json) as file:
                 file.write(text)
     print(as_text(comparison))
     for warning in found.warnings:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.common.output_files import write_whole
+from fourbar_ros.common.output_files import atomic_file
 
 EPILOG = """\
 CASE.json holds mechanism, initial (link_angles, link_rates [rad, rad/s],
@@ -75,7 +75,7 @@ def _run_motion(args: argparse.Namespace) -> int:
         motion.times, motion.link_angles, motion.link_rates, motion.flywheel_speeds_absolute])
     header = ','.join(['t', *(f'{kind}_{link}' for kind in ('link', 'rate', 'flywheel')
                               for link in 'abcd')])
-    with write_whole(args.output) as file:
+    with atomic_file(args.output) as file:
         np.savetxt(file, table, fmt='%.15g', delimiter=',', header=header, comments='')
     print('branch: ' + ', '.join(
         f'{branch} from t = {time:g} s' for time, branch in motion.branches()))
@@ -93,7 +93,7 @@ def _run_closed_loop(args: argparse.Namespace) -> int:
     changes = {name: value for name in ('seed', 'duration')
                if (value := getattr(args, name)) is not None}
     scenario = replace(load_scenario(args.closed_loop), **changes)
-    with write_whole(args.output) as file:
+    with atomic_file(args.output) as file:
         # Not while the bar is there, and not in the numbers per second that it shows.
         with announced():
             warm_up()

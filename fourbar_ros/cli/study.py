@@ -41,14 +41,14 @@ def run(args: argparse.Namespace) -> int:
     """Run the study, print and write what it found."""
     from fourbar_ros.cli.progress import show_progress
     from fourbar_ros.common.checks import checks_as_json, print_checks
-    from fourbar_ros.common.output_files import check_file, kept_folder, write_files
+    from fourbar_ros.common.output_files import check_file, output_folder, write_files
     from fourbar_ros.kernels.compiler import announced
 
     folder = args.output or Path(f'study_{args.name}')
     study = load_study(args.name, folder, **{
         name: value for name in OPTIONS if (value := getattr(args, name)) is not None})
     # Made before the work, not after it.
-    with kept_folder(folder):
+    with output_folder(folder):
         if args.json:
             check_file(args.json)
         with announced():

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A number measured, the limit it has to keep, and whether it does."""
+"""Checks: a measured value, its limit, and whether the value keeps the limit."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from typing import Any, TextIO
 @dataclass(frozen=True)
 class Check:
     """
-    One number and its limit.
+    One measured value and its limit.
 
-    Made by :func:`at_most`, :func:`at_least` and :func:`within`, which raise ValueError for a
+    :func:`at_most`, :func:`at_least` and :func:`within` make checks. They raise ValueError for a
     limit that is not finite.
 
     :param name: what was measured.
-    :param value: as measured; one that is not finite never passes.
+    :param value: measured value; a value that is not finite never passes.
     :param unit: of value and limit, '' for none.
     :param limit: a number, or (low, high); the limit itself passes.
-    :param passed: whether the value keeps it.
-    :param relation: of value and limit, for the table: '<=', '>=' or 'in'.
+    :param passed: whether the value keeps the limit.
+    :param relation: '<=', '>=' or 'in', for the printed table.
     """
 
     name: str
@@ -52,7 +52,7 @@ def within(name: str, value: float, unit: str, low: float, high: float) -> Check
 
 def print_checks(checks: Sequence[Check], file: TextIO | None = None) -> None:
     """
-    Print an aligned table, one check a line, `ok` or `MISSED` at its end.
+    Print an aligned table, one check a line, with `ok` or `MISSED` at the end.
 
     :param file: default standard output.
     """
@@ -67,7 +67,7 @@ def print_checks(checks: Sequence[Check], file: TextIO | None = None) -> None:
 
 def checks_as_json(checks: Iterable[Check]) -> list[dict[str, Any]]:
     """
-    Return what goes under `checks` in a JSON file.
+    Return the list that a JSON file holds under `checks`.
 
     :returns: per check `name`, `value` (None where it is not finite), `unit`, `limit` (a number
         or [low, high]) and `passed`.
@@ -78,16 +78,16 @@ def checks_as_json(checks: Iterable[Check]) -> list[dict[str, Any]]:
 
 
 def finite_or_none(value: float) -> float | None:
-    """Return the number for JSON, which has neither nan nor infinity."""
+    """Return the number, or None in place of NaN and infinity, which JSON lacks."""
     return value if isfinite(value) else None
 
 
 def _check(name: str, value: float, unit: str, limit: float | tuple[float, float],
            passed: bool, relation: str) -> Check:
-    # float() and bool() because numpy's own kinds are none of JSON's.
+    # JSON takes no numpy scalars.
     limit = (float(limit[0]), float(limit[1])) if isinstance(limit, tuple) else float(limit)
     if not all(map(isfinite, limit if isinstance(limit, tuple) else (limit,))):
-        raise ValueError(f'{name} has the limit {limit}, which is none')
+        raise ValueError(f'limit of {name} must be finite, got {limit}')
     return Check(name, float(value), unit, limit, bool(passed) and isfinite(value), relation)
 
 

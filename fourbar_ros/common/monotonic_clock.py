@@ -1,16 +1,16 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The clock that nobody can set."""
+"""The monotonic clock of the suite."""
 
 import time
 
 
 def monotonic_ns() -> int:
     """
-    Read the clock that nobody can set [ns].
+    Read the raw monotonic clock [ns], which cannot be set and is not disciplined by NTP.
 
-    The very one that timers run on (rcutils): Python's monotonic clock is disciplined by NTP and
-    would slowly slide past it.
+    The timers of rcutils run on the same clock. `time.monotonic_ns` drifts against them by the
+    frequency correction of NTP.
     """
     return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)

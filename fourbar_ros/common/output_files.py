@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Output files that are either whole or not there."""
+"""Atomic output: a file or folder is complete, or it does not exist."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ from fourbar_ros.common.errors import FourbarError
 
 
 class OutputError(FourbarError):
-    """An output file or folder that cannot be written."""
+    """
+    An output file or folder that cannot be written.
+
+    Its `values` hold `path` and, where the operating system refused, `errno`.
+    """
 
 
 @contextmanager
-def write_whole(path: Path) -> Iterator[TextIO]:
+def atomic_file(path: Path) -> Iterator[TextIO]:
     """
-    Open a text file that appears under its name only once it is complete.
+    Open a text file that appears under its name when it is complete.
 
     :raises OutputError: the folder is missing or not writable, the disk is full, or the path is
         a folder, a pipe or a device.
@@ -41,18 +45,18 @@ def write_whole(path: Path) -> Iterator[TextIO]:
         if name:
             Path(name).unlink(missing_ok=True)
         if isinstance(error, OSError):
-            raise OutputError(f'cannot write {path}: {error.strerror or error}') from None
+            raise _write_error(path, error) from None
         raise
 
 
 def write_files(contents: Mapping[Path, str | bytes]) -> None:
     """
-    Write files, each whole or not at all.
+    Write files, each of them atomically.
 
-    :raises OutputError: as :func:`write_whole`; those before it are written.
+    :raises OutputError: as :func:`atomic_file`; the files before the refused one are written.
     """
     for path, content in contents.items():
-        with write_whole(path) as file:
+        with atomic_file(path) as file:
             if isinstance(content, bytes):
                 file.buffer.write(content)
             else:
@@ -61,80 +65,90 @@ def write_files(contents: Mapping[Path, str | bytes]) -> None:
 
 def check_file(path: Path) -> None:
     """
-    Refuse a file that :func:`write_whole` could not write, before the work that it is for.
+    Refuse an output file before the work starts, if :func:`atomic_file` could not write it.
 
-    :raises OutputError: with what stands in the way.
+    :raises OutputError: with the reason.
     """
     parent = path.absolute().parent
     if not parent.is_dir():
-        raise OutputError(f'cannot write {path}: no such folder')
+        raise OutputError(f'cannot write {path}: no such folder', path=path)
     _check_regular(path)
     if not os.access(parent, os.W_OK | os.X_OK):
-        raise OutputError(f'cannot write {path}: {parent} is not writable')
+        raise OutputError(f'cannot write {path}: {parent} is not writable', path=path)
 
 
 def check_new_folder(folder: Path) -> None:
     """
     Refuse a folder that exists or cannot be made.
 
-    :raises OutputError: with what stands in the way.
+    :raises OutputError: with the reason.
     """
     if folder.exists():
-        raise OutputError(f'{folder} exists already: choose another name or remove it')
+        raise OutputError(f'{folder} exists already: choose another name or remove it',
+                          path=folder)
     parent = next(above for above in folder.absolute().parents if above.exists())
     if not parent.is_dir():
-        raise OutputError(f'cannot make {folder}: {parent} is not a directory')
+        raise OutputError(f'cannot make {folder}: {parent} is not a directory', path=folder)
     if not os.access(parent, os.W_OK | os.X_OK):
-        raise OutputError(f'cannot make {folder}: {parent} is not writable')
+        raise OutputError(f'cannot make {folder}: {parent} is not writable', path=folder)
 
 
 @contextmanager
-def kept_folder(folder: Path) -> Iterator[None]:
+def output_folder(folder: Path) -> Iterator[None]:
     """
-    Make a folder if it is missing, and its parents; if nothing comes of it, not even those stay.
+    Make a folder and its parents where they are missing, for the files that the block writes.
 
-    :raises OutputError: it cannot be made, or nothing can be written into it.
+    If the block fails, the folders that it made and left empty are removed.
+
+    :raises OutputError: the folder cannot be made or is not writable.
     """
     path = folder.absolute()
     missing = [above for above in (path, *path.parents) if not above.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f'cannot make {folder}: {error.strerror}') from None
+        raise OutputError(f'cannot make {folder}: {error.strerror}', path=folder,
+                          errno=error.errno) from None
     if not os.access(path, os.W_OK | os.X_OK):
-        raise OutputError(f'cannot write into {folder}: it is not writable')
+        raise OutputError(f'cannot write into {folder}: it is not writable', path=folder)
     try:
         yield
     except BaseException:
-        for made in missing:
+        for empty in missing:
             with suppress(OSError):
-                made.rmdir()    # one that holds something stays
+                empty.rmdir()   # refuses a folder that holds a file
         raise
 
 
 @contextmanager
-def whole_folder(folder: Path) -> Iterator[Path]:
+def atomic_folder(folder: Path) -> Iterator[Path]:
     """
-    Make a folder that appears under its name only once it is complete.
+    Make a folder that appears under its name when it is complete.
 
-    :returns: where to make it: a path of the same name, with nothing there.
-    :raises OutputError: it exists already, cannot be made, or the disk is full.
+    :returns: temporary path of the same name, where the block makes the folder.
+    :raises OutputError: the folder exists already or cannot be made, or the disk is full.
     """
     check_new_folder(folder)
     parent = folder.absolute().parent
     try:
         parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=parent, prefix=f'.{folder.name}.') as temporary:
-            made = Path(temporary) / folder.name
-            yield made
-            os.rename(made, folder)
+            unfinished = Path(temporary) / folder.name
+            yield unfinished
+            os.rename(unfinished, folder)
     except OSError as error:
-        raise OutputError(f'cannot write {folder}: {error.strerror or error}') from None
+        raise _write_error(folder, error) from None
+
+
+def _write_error(path: Path, error: OSError) -> OutputError:
+    return OutputError(f'cannot write {path}: {error.strerror or error}', path=path,
+                       errno=error.errno)
 
 
 def _check_regular(path: Path) -> None:
+    # Replacing a device or a pipe, such as /dev/null, by a file would harm the machine.
     if os.path.exists(path) and not os.path.isfile(path):
-        raise OutputError(f'cannot write {path}: it is not a regular file')
+        raise OutputError(f'cannot write {path}: it is not a regular file', path=path)
 
 
 def _umask() -> int:

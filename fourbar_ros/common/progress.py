@@ -1,6 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How work that takes time tells how far it is, without knowing who shows it."""
+
+"""Progress of long work; the caller decides how it is shown."""
 
 from __future__ import annotations
 
@@ -8,18 +9,18 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
-"""Wraps an iterable that takes time, given also its length."""
+"""Wraps an iterable of known length; a progress bar, or nothing."""
 
 
-def remark(shown: Iterable[Any], text: str) -> None:
-    """Say something beside the progress, where it is shown."""
-    say = getattr(shown, 'set_postfix_str', None)
-    if say is not None:
-        say(text)
+def show_note(shown: Iterable[Any], text: str) -> None:
+    """Show a note beside the progress bar, if there is one."""
+    set_note = getattr(shown, 'set_postfix_str', None)
+    if set_note is not None:
+        set_note(text)
 
 
-def begin_at(shown: Iterable[Any], done: int) -> None:
-    """Let the progress begin with so many steps that were made before, where it is shown."""
+def resume_at(shown: Iterable[Any], done: int) -> None:
+    """Start the progress bar, if there is one, at the number of steps done before."""
     bar: Any = shown
     if hasattr(bar, 'initial'):
         bar.initial = bar.n = bar.last_print_n = done

@@ -193,7 +193,8 @@ def _rows(kind: type[Any], prefix: str) -> Iterator[Setting]:
         if declared is not None:
             attributes = {**vars(declared), 'name': prefix + item.name}
             if declared.default is MISSING:
-                attributes['kind'] = _TYPES[str(item.type)]
+                # The annotation is text where a module postpones its evaluation.
+                attributes['kind'] = _TYPES.get(str(item.type), item.type)
             yield Setting(**attributes)
 
 

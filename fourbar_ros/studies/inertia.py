@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from fourbar_ros.common.checks import at_least, at_most, Check, within
-from fourbar_ros.common.progress import Progress, remark
+from fourbar_ros.common.progress import Progress, show_note
 from fourbar_ros.control.allocation import mobilities
 from fourbar_ros.control.soft_step import SoftStep
 from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism
@@ -133,7 +133,7 @@ def run(progress: Progress, sample: Sample, folder: Path | None) -> Result:
         for (kind, search), (variables, evaluations) in zip(listed, shown):
             found.append(Found(kind, search, decode(np.array(variables)), evaluations))
             best = best_of(found)
-            remark(shown, f'best {best.ratio:.5f} of the closed form at {best.error:.3f} deg')
+            show_note(shown, f'best {best.ratio:.5f} of the closed form at {best.error:.3f} deg')
     best = best_of(found)
     paper = _paper_inertias()
     files: dict[str, str | bytes] = {'inertia.csv': _csv(found)}

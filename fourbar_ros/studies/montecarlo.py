@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from fourbar_ros.common.checks import finite_or_none
-from fourbar_ros.common.progress import begin_at, Progress
+from fourbar_ros.common.progress import Progress, resume_at
 from fourbar_ros.loop.scenario import scenario_from
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.studies import cores, figures, Result, Sample, StudyError
@@ -84,7 +84,7 @@ def run(progress: Progress, folder: Path | None, campaign: str, runs: int | None
         try:
             with contextlib.closing(found), contextlib.closing(_kept(found, kept)) as rows:
                 shown = progress(rows, sample.runs)
-                begin_at(shown, finished)
+                resume_at(shown, finished)
                 for _ in shown:
                     finished += 1
             rows_with_time = kept.rows()

@@ -18,7 +18,7 @@ import time
 from typing import Any
 
 from fourbar_ros.cli.main import main
-from fourbar_ros.common.progress import begin_at
+from fourbar_ros.common.progress import resume_at
 from fourbar_ros.loop import ClosedLoop
 from fourbar_ros.studies import montecarlo, Result, StudyError
 from fourbar_ros.studies.campaigns import folder as campaign_folder
@@ -156,10 +156,10 @@ def test_finished_campaign_is_not_run_again_and_takes_more_runs(
 
 def test_progress_begins_with_what_is_done() -> None:
     bar = tqdm(iter(range(7)), total=10, file=StringIO(), mininterval=0.0, miniters=1)
-    begin_at(bar, 3)
+    resume_at(bar, 3)
     assert [bar.n for _ in bar][-1] == 9
     assert (bar.n, bar.initial) == (10, 3)
-    begin_at([1, 2], 1)
+    resume_at([1, 2], 1)
 
 
 @pytest.mark.parametrize(('change', 'told'), [

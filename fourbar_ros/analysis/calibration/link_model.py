@@ -147,8 +147,8 @@ def windows_of(links: LinkSignal, wheels: WheelSignal, window_s: float = WINDOW_
             'needed at least')
     found = []
     for n in range(count):
-        begin_at = first + n * length
-        ticks = wheels.times[begin_at:begin_at + length + 1]
+        resume_at = first + n * length
+        ticks = wheels.times[resume_at:resume_at + length + 1]
         begin = ticks[0]
         samples = []
         for link in range(4):
@@ -158,7 +158,7 @@ def windows_of(links: LinkSignal, wheels: WheelSignal, window_s: float = WINDOW_
         at = np.array([curve(begin) for curve in curves])
         rates = [curves[link].derivative()(begin) for link in (0, 1)]
         found.append(Window(
-            ticks, np.diff(speeds[begin_at:begin_at + length + 1], axis=0)
+            ticks, np.diff(speeds[resume_at:resume_at + length + 1], axis=0)
             / np.diff(ticks)[:, None], tuple(samples), np.array([at[0], at[1], *rates]), at))
     return found
 
