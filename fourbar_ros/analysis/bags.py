@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.names import ESTIMATE_LINK_STATES, SIM_FLYWHEEL_STATES, SIM_LINK_STATES
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +21,7 @@ DIAGNOSTIC_STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'
 
 # Relative names that end in another name of the API: /sim/flywheel_states is not the
 # flywheel_states of a suite in the namespace /sim unless the caller says so.
-_LONGER_NAMES = ('sim/link_states', 'sim/flywheel_states', 'estimate/link_states')
+_LONGER_NAMES = (SIM_LINK_STATES, SIM_FLYWHEEL_STATES, ESTIMATE_LINK_STATES)
 
 Floats = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]

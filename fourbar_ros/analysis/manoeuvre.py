@@ -14,11 +14,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fourbar_ros.analysis.bags import BagError, Floats, JointSeries, Nanoseconds, Recording
+from fourbar_ros.common.names import (
+    CONTROLLER_STATUS,
+    ESTIMATE_LINK_STATES,
+    FLYWHEEL_STATES,
+    REFERENCE,
+    SETPOINT,
+)
 from fourbar_ros.mechanism import LINK_NAMES
 from fourbar_ros.mechanism.angles import wrap_angles
 import numpy as np
 
-ESSENTIAL_TOPICS = ('setpoint', 'reference', 'estimate/link_states', 'flywheel_states')
+ESSENTIAL_TOPICS = (SETPOINT, REFERENCE, ESTIMATE_LINK_STATES, FLYWHEEL_STATES)
 
 DEFAULT_SETPOINT_DURATION_S = 10.0
 # The recorder can hear a setpoint this much earlier or later than the controller acts on it.
@@ -105,8 +112,8 @@ def find_motion(recording: Recording) -> Motion:
     """
     for name in ESSENTIAL_TOPICS:
         recording.arrivals(name)
-    setpoints = recording.arrivals('setpoint').select(LINK_NAMES)
-    reference = recording.joint_states('reference').select(LINK_NAMES)
+    setpoints = recording.arrivals(SETPOINT).select(LINK_NAMES)
+    reference = recording.joint_states(REFERENCE).select(LINK_NAMES)
     duration_ns = round(setpoint_duration_s(recording) * 1e9)
     for number in reversed(range(len(setpoints))):
         start = _start(reference, int(setpoints.received_ns[number]))
@@ -123,8 +130,8 @@ def find_motion(recording: Recording) -> Motion:
 
 def setpoint_duration_s(recording: Recording) -> float:
     """Return how long the controller takes for a setpoint, from its status, else 10 s."""
-    if recording.has('controller_status'):
-        for status in reversed(recording.statuses('controller_status')):
+    if recording.has(CONTROLLER_STATUS):
+        for status in reversed(recording.statuses(CONTROLLER_STATUS)):
             text = status.values.get('setpoint_duration_s', '')
             try:
                 return float(text)

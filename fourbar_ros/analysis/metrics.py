@@ -15,6 +15,7 @@ import warnings
 
 from fourbar_ros.analysis.bags import BagError, Floats, JointSeries, Nanoseconds, Recording
 from fourbar_ros.analysis.manoeuvre import find_motion, Motion, pair, Paired
+from fourbar_ros.common import names
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.angles import wrap_angles
 import numpy as np
@@ -96,13 +97,13 @@ def metrics(recording: Recording, mechanism: Mechanism | None = None) -> dict[st
     motion = find_motion(recording)
     found: dict[str, float] = {}
     missing: dict[str, str] = {}
-    for names, measure in _measurements(recording, motion, mechanism):
+    for keys, measure in _measurements(recording, motion, mechanism):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter('ignore', RuntimeWarning)  # nanmax of nothing but NaN
-                values = dict(zip(names, measure()))
+                values = dict(zip(keys, measure()))
         except BagError as error:
-            missing.update(dict.fromkeys(names, str(error)))
+            missing.update(dict.fromkeys(keys, str(error)))
             continue
         for name, value in values.items():
             if np.isfinite(value):
@@ -124,7 +125,7 @@ _Measurement = tuple[tuple[str, ...], Callable[[], tuple[float, ...]]]
 
 def _measurements(recording: Recording, motion: Motion,
                   mechanism: Mechanism | None) -> list[_Measurement]:
-    truth, estimate = 'sim/link_states', 'estimate/link_states'
+    truth, estimate = names.SIM_LINK_STATES, names.ESTIMATE_LINK_STATES
     return [
         (('tracking.rms_rad', 'tracking.peak_rad'),
          lambda: _tracking(recording, motion, truth)),
@@ -138,9 +139,9 @@ def _measurements(recording: Recording, motion: Motion,
         (('estimate.within_2_sigma',), lambda: _within_2_sigma(recording, motion)),
         (('estimate.mean_nis_per_degree_of_freedom',), lambda: _mean_nis(recording, motion)),
         (('flywheel.peak_speed_rad_s',),
-         lambda: _peak_speed(recording, motion, 'sim/flywheel_states')),
+         lambda: _peak_speed(recording, motion, names.SIM_FLYWHEEL_STATES)),
         (('flywheel.measured_peak_speed_rad_s',),
-         lambda: _peak_speed(recording, motion, 'flywheel_states')),
+         lambda: _peak_speed(recording, motion, names.FLYWHEEL_STATES)),
         (('flywheel.peak_torque_n_m',), lambda: _peak_torque(recording, motion)),
         (('flywheel.peak_energy_j', 'flywheel.final_energy_j'),
          lambda: _peak_and_last(flywheel_energy(recording, motion, mechanism)[1])),
@@ -160,8 +161,8 @@ def estimate_error(recording: Recording, motion: Motion) -> Paired:
 
     :raises BagError: one of the two is not in the recording.
     """
-    return pair(_within(recording, motion, 'estimate/link_states'),
-                _within(recording, motion, 'sim/link_states'), LINK_NAMES)
+    return pair(_within(recording, motion, names.ESTIMATE_LINK_STATES),
+                _within(recording, motion, names.SIM_LINK_STATES), LINK_NAMES)
 
 
 def flywheel_energy(recording: Recording, motion: Motion,
@@ -173,8 +174,8 @@ def flywheel_energy(recording: Recording, motion: Motion,
     """
     if mechanism is None:
         raise BagError(f'the mechanism of {recording.path} is unknown: give --mechanism')
-    links = _within(recording, motion, 'sim/link_states').select(LINK_NAMES)
-    wheels = _within(recording, motion, 'sim/flywheel_states').select(FLYWHEEL_NAMES)
+    links = _within(recording, motion, names.SIM_LINK_STATES).select(LINK_NAMES)
+    wheels = _within(recording, motion, names.SIM_FLYWHEEL_STATES).select(FLYWHEEL_NAMES)
     both = pair(links, wheels, LINK_NAMES)
     relative = wheels.rows(np.isin(wheels.stamp_ns, both.stamp_ns)).velocity
     absolute = both.left.velocity + relative
@@ -210,7 +211,7 @@ def _tracking(recording: Recording, motion: Motion, actual: str) -> tuple[float,
     end_ns = min(motion.step_end_ns, motion.end_ns)
     return _rms_and_peak(pair(
         _within(recording, motion, actual, end_ns),
-        _within(recording, motion, 'reference', end_ns), INDEPENDENT_LINKS).difference)
+        _within(recording, motion, names.REFERENCE, end_ns), INDEPENDENT_LINKS).difference)
 
 
 def _final_error(recording: Recording, motion: Motion, actual: str) -> tuple[float, ...]:
@@ -224,14 +225,14 @@ def _final_error(recording: Recording, motion: Motion, actual: str) -> tuple[flo
 
 def _within_2_sigma(recording: Recording, motion: Motion) -> tuple[float, ...]:
     error = estimate_error(recording, motion)
-    both = pair(error.left, recording.joint_states('estimate/sigma'), LINK_NAMES)
+    both = pair(error.left, recording.joint_states(names.ESTIMATE_SIGMA), LINK_NAMES)
     known = np.isin(error.stamp_ns, both.stamp_ns)
     return (float(np.mean(np.abs(error.difference[known]) <= 2.0 * both.right.position)),)
 
 
 def _mean_nis(recording: Recording, motion: Motion) -> tuple[float, ...]:
     # As received: one tick may bring several measurements, all with the stamp of the tick.
-    innovation = recording.arrivals('estimate/innovation').between(
+    innovation = recording.arrivals(names.ESTIMATE_INNOVATION).between(
         motion.start_ns, motion.end_ns).select(('nis', 'degrees_of_freedom')).position
     nis, degrees = np.nansum(innovation, axis=0)
     if not degrees > 0:
@@ -244,11 +245,11 @@ def _peak_speed(recording: Recording, motion: Motion, name: str) -> tuple[float,
 
 
 def _peak_torque(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    return (float(np.nanmax(np.abs(_within(recording, motion, 'flywheel_states').effort))),)
+    return (float(np.nanmax(np.abs(_within(recording, motion, names.FLYWHEEL_STATES).effort))),)
 
 
 def _energy(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    energy, eq9, work, copper = _within(recording, motion, 'energy').select(
+    energy, eq9, work, copper = _within(recording, motion, names.ENERGY).select(
         ('flywheel_energy_j', 'eq9_j_s', 'work_j', 'copper_loss_j')).position.T
     # Recordings from before it was told have none.
     told = np.isfinite(copper).any()
@@ -257,7 +258,7 @@ def _energy(recording: Recording, motion: Motion) -> tuple[float, ...]:
 
 
 def _ticks(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    stamps = _within(recording, motion, 'timing').stamp_ns
+    stamps = _within(recording, motion, names.TIMING).stamp_ns
     periods = np.diff(stamps)
     if not len(periods):
         raise BagError(f'{recording.path}: a single tick since the setpoint')
@@ -266,7 +267,7 @@ def _ticks(recording: Recording, motion: Motion) -> tuple[float, ...]:
 
 
 def _round_trip(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    trips = _within(recording, motion, 'timing').select(('round_trip_s',)).position * 1e3
+    trips = _within(recording, motion, names.TIMING).select(('round_trip_s',)).position * 1e3
     if np.all(np.isnan(trips)):
         raise BagError(f'{recording.path}: no tick was answered since the setpoint')
     p50, p99, worst = np.nanpercentile(trips, [50, 99, 100])
@@ -274,7 +275,7 @@ def _round_trip(recording: Recording, motion: Motion) -> tuple[float, ...]:
 
 
 def _lost(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    lost = _within(recording, motion, 'timing').select(('lost',)).position[:, 0]
+    lost = _within(recording, motion, names.TIMING).select(('lost',)).position[:, 0]
     if np.all(np.isnan(lost)):
         raise BagError(f'{recording.path}: timing does not count lost ticks')
     return (int(_growth(lost)),)

@@ -21,28 +21,26 @@ from typing import Any, TYPE_CHECKING
 from fourbar_ros.analysis.bags import BagError, DIAGNOSTIC_STATUS, JOINT_STATE, JointSeries
 from fourbar_ros.analysis.stored_bag import copier, open_bag, StoredBag
 from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.names import (
+    DIAGNOSTICS,
+    ESTIMATE_INNOVATION,
+    ESTIMATE_LINK_STATES,
+    ESTIMATE_WAITING,
+    FLYWHEEL_COMMAND,
+    FLYWHEEL_STATES,
+    SIM_LINK_STATES,
+)
 from fourbar_ros.common.progress import Progress
 from fourbar_ros.estimation import EstimatorSettings
 from fourbar_ros.estimation.parameters import PARAMETERS
-from fourbar_ros.estimation.topics import (
-    COMMAND,
-    EstimatorTopics,
-    INNOVATION,
-    INPUTS,
-    Message,
-    OUTPUTS,
-    STATES,
-    TICK,
-    WAITING,
-)
+from fourbar_ros.estimation.topics import EstimatorTopics, INPUTS, Message, OUTPUTS
 from fourbar_ros.mechanism import LINK_NAMES, load_mechanism
 import numpy as np
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
-TRUTH = 'sim/link_states'
-DIAGNOSTICS, DIAGNOSTIC_ARRAY = '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray'
+DIAGNOSTIC_ARRAY = 'diagnostic_msgs/msg/DiagnosticArray'
 HEADER = 'std_msgs/msg/Header'
 NODE = 'estimator'
 COUNTERS = ('rejected', 'gated')
@@ -242,7 +240,8 @@ def find_namespace(stored: StoredBag, wanted: str | None = None) -> str:
             raise BagError(f'{stored.path}: no topic {topic}: {_what_it_has(topics)}')
         if not any(counts):
             raise BagError(f'{stored.path}: no message on {topic}')
-    for name in (*INPUTS, COMMAND, STATES, INNOVATION, TRUTH):
+    for name in (*INPUTS, FLYWHEEL_COMMAND, ESTIMATE_LINK_STATES, ESTIMATE_INNOVATION,
+                 SIM_LINK_STATES):
         kind = topics.get(f'{chosen}/{name}', JOINT_STATE)
         if kind != JOINT_STATE:
             raise BagError(f'{stored.path}: {chosen}/{name} is {kind}, not {JOINT_STATE}')
@@ -284,7 +283,7 @@ class _Run:
         self._topics = topics
         self._namespace = namespace
         self._relative = {f'{namespace}/{name}': name for name in (
-            *INPUTS, COMMAND, *OUTPUTS, WAITING, TRUTH)}
+            *INPUTS, FLYWHEEL_COMMAND, *OUTPUTS, ESTIMATE_WAITING, SIM_LINK_STATES)}
         self._faults: Counter[str] = Counter()
         self._seen_faults: dict[str, float | None] = {}
 
@@ -293,19 +292,19 @@ class _Run:
         copy = copier(writer, self.warnings.append)
         publish = _Publisher(writer, self._namespace, self._stored.connections)
         copies = [connection for connection in self._stored.connections
-                  if self._relative.get(connection.topic) not in (*OUTPUTS, WAITING)]
+                  if self._relative.get(connection.topic) not in (*OUTPUTS, ESTIMATE_WAITING)]
         for connection in copies:
             copy(connection)
         stream: Any = self._stored.messages()
         total = sum(connection.msgcount for connection in self._stored.connections)
         for connection, logged_ns, data in progress(stream, total) if progress else stream:
             name = self._relative.get(connection.topic)
-            if name not in OUTPUTS and name != WAITING:
+            if name not in OUTPUTS and name != ESTIMATE_WAITING:
                 writer.write(copy(connection), logged_ns, data)
             if connection.topic == DIAGNOSTICS and connection.msgtype == DIAGNOSTIC_ARRAY:
                 self._diagnosed(self._stored.content(connection, data))
-            elif name in (*INPUTS, STATES, INNOVATION, TRUTH) or (
-                    name == COMMAND and self._topics.needs_commands):
+            elif name in (*INPUTS, ESTIMATE_LINK_STATES, ESTIMATE_INNOVATION, SIM_LINK_STATES) or (
+                    name == FLYWHEEL_COMMAND and self._topics.needs_commands):
                 for answer in self._take(name, self._stored.content(connection, data)):
                     publish(answer, logged_ns)
         self._conclude()
@@ -313,17 +312,17 @@ class _Run:
     def _take(self, name: str, message: Any) -> tuple[Message, ...]:
         """Note a message, and hand it to the estimator if it is for it."""
         stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-        if name in (STATES, TRUTH):
-            log = self.recorded.states if name == STATES else self.truth
+        if name in (ESTIMATE_LINK_STATES, SIM_LINK_STATES):
+            log = self.recorded.states if name == ESTIMATE_LINK_STATES else self.truth
             log.add(stamp_ns, message.name, message.position, message.velocity)
             return ()
-        if name == INNOVATION:
+        if name == ESTIMATE_INNOVATION:
             self.recorded.nis.add(stamp_ns, message.name, message.position)
             return ()
         answer = self._topics.receive(name, stamp_ns, message.name, message.position,
                                       message.velocity, message.effort)
         messages = tuple(answer.messages)
-        if name == TICK and not answer.rejection and (
+        if name == FLYWHEEL_STATES and not answer.rejection and (
                 not self.ticks_ns or self.ticks_ns[-1] != stamp_ns):
             self._note_tick(stamp_ns, messages)
         return messages
@@ -331,12 +330,12 @@ class _Run:
     def _note_tick(self, stamp_ns: int, messages: tuple[Message, ...]) -> None:
         self.ticks_ns.append(stamp_ns)
         for message in messages:
-            if message.topic == STATES:
+            if message.topic == ESTIMATE_LINK_STATES:
                 angles, rates = (values.tolist() for values in message.values[:2])
                 self.replayed.states.add(stamp_ns, message.names, angles, rates)
-            elif message.topic == INNOVATION:
+            elif message.topic == ESTIMATE_INNOVATION:
                 self.replayed.nis.add(stamp_ns, message.names, message.values[0].tolist())
-            elif message.topic == WAITING:
+            elif message.topic == ESTIMATE_WAITING:
                 self.waiting += 1
         self._faults.update(f'{sensor}: {fault}' for sensor, fault in
                             self._topics.estimator.sensor_faults().items())
@@ -382,15 +381,15 @@ class _Publisher:
         # As they were offered to the recorder.
         self._offered: dict[str, Any] = {
             connection.topic: connection.ext for connection in recorded}
-        for name in (*OUTPUTS, WAITING):
-            if name == WAITING or not OUTPUTS[name].optional:
+        for name in (*OUTPUTS, ESTIMATE_WAITING):
+            if name == ESTIMATE_WAITING or not OUTPUTS[name].optional:
                 self._offer(name)
 
     def _offer(self, name: str) -> None:
         topic, offered = f'{self._namespace}/{name}', self._offered
         profiles = offered[topic].offered_qos_profiles if topic in offered else ()
         self._connections[name] = self._writer.add_connection(
-            topic, HEADER if name == WAITING else JOINT_STATE, typestore=self._store,
+            topic, HEADER if name == ESTIMATE_WAITING else JOINT_STATE, typestore=self._store,
             offered_qos_profiles=profiles)
 
     def __call__(self, message: Message, logged_ns: int) -> None:

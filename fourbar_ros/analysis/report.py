@@ -16,6 +16,7 @@ from typing import Any
 from fourbar_ros.analysis.bags import BagError, read_bag, Recording
 from fourbar_ros.analysis.manoeuvre import find_motion
 from fourbar_ros.analysis.metrics import MEANINGS, metrics
+from fourbar_ros.common import names
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.progress import Progress
 from fourbar_ros.mechanism import load_mechanism, Mechanism
@@ -96,8 +97,8 @@ def write_report(bag: str | Path, html: str | Path, metrics_json: str | Path,
 
 def _recorded_mechanism(recording: Recording) -> Mechanism | None:
     """Return the mechanism that the device named, None if it did not or it is not here."""
-    if recording.has('device_status'):
-        for status in reversed(recording.statuses('device_status')):
+    if recording.has(names.DEVICE_STATUS):
+        for status in reversed(recording.statuses(names.DEVICE_STATUS)):
             if name := status.values.get('mechanism'):
                 try:
                     return load_mechanism(name)

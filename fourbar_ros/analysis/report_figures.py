@@ -15,6 +15,7 @@ from typing import Any
 from fourbar_ros.analysis.bags import BagError, Floats, JointSeries, Nanoseconds, Recording
 from fourbar_ros.analysis.manoeuvre import Motion, pair, Paired
 from fourbar_ros.analysis.metrics import flywheel_energy
+from fourbar_ros.common import names
 from fourbar_ros.mechanism import (
     com_positions_in_table,
     FLYWHEEL_NAMES,
@@ -63,8 +64,8 @@ class View:
 
     def links(self) -> JointSeries:
         """Return the ground truth of the links if the bag has it, else the estimate."""
-        truth = self.recording.has('sim/link_states')
-        return self.series('sim/link_states' if truth else 'estimate/link_states')
+        truth = self.recording.has(names.SIM_LINK_STATES)
+        return self.series(names.SIM_LINK_STATES if truth else names.ESTIMATE_LINK_STATES)
 
     def mark_step(self, axes: Axes) -> None:
         """Mark where the step begins and ends."""
@@ -106,8 +107,8 @@ def linkage(view: View) -> Figure:
 
 def _absolute_speeds(view: View, links: JointSeries) -> Floats:
     """Return absolute wheel speeds at the stamps of links (n, 4), NaN where unknown."""
-    source = 'sim/flywheel_states' if view.recording.has('sim/flywheel_states') else (
-        'flywheel_states')
+    source = names.SIM_FLYWHEEL_STATES if view.recording.has(names.SIM_FLYWHEEL_STATES) else (
+        names.FLYWHEEL_STATES)
     wheels = view.series(source).select(FLYWHEEL_NAMES)
     speeds = np.full((len(links), 4), np.nan)
     _, in_links, in_wheels = np.intersect1d(links.stamp_ns, wheels.stamp_ns, return_indices=True)
@@ -148,12 +149,12 @@ def angles(view: View) -> Figure:
     """Plot the angle of each link: goal, reference, truth, estimate, raw samples."""
     figure = Figure(figsize=(style.WIDTH_IN, 5.0), layout='constrained')
     panels = figure.subplots(2, 2, sharex=True).ravel()
-    reference = view.series('reference').select(LINK_NAMES)
-    curves = [('estimate', view.series('estimate/link_states'),
+    reference = view.series(names.REFERENCE).select(LINK_NAMES)
+    curves = [('estimate', view.series(names.ESTIMATE_LINK_STATES),
                {'linewidth': 1.3, 'color': COLOURS['ink']}),
               ('reference', reference, {'linewidth': 1.3, 'linestyle': (0, (3, 3))})]
-    if view.recording.has('sim/link_states'):
-        curves.insert(0, ('ground truth', view.series('sim/link_states'),
+    if view.recording.has(names.SIM_LINK_STATES):
+        curves.insert(0, ('ground truth', view.series(names.SIM_LINK_STATES),
                           {'linewidth': 5.0, 'alpha': 0.4}))
     for link, axes in enumerate(panels):
         shown = {'color': LINK_COLOURS[link]}
@@ -205,9 +206,9 @@ def _goal_line(view: View, axes: Axes, link: int, reference: JointSeries) -> Non
 
 def _raw_samples(view: View, axes: Axes, link: int, reference: JointSeries,
                  near: tuple[int, int] | None = None) -> None:
-    if not view.recording.has('link_angles'):
+    if not view.recording.has(names.LINK_ANGLES):
         return
-    raw = view.series('link_angles').select(LINK_NAMES)
+    raw = view.series(names.LINK_ANGLES).select(LINK_NAMES)
     if near is not None:
         raw = raw.between(*near)
     # Raw angles lie in (-pi, pi]: show them on the turn that the reference is on.
@@ -220,10 +221,10 @@ def _raw_samples(view: View, axes: Axes, link: int, reference: JointSeries,
 
 def errors(view: View) -> Figure:
     """Plot the tracking error of a and b and the estimate error of all links with its band."""
-    estimate, reference = view.series('estimate/link_states'), view.series('reference')
-    if not view.recording.has('sim/link_states'):
+    estimate, reference = view.series(names.ESTIMATE_LINK_STATES), view.series(names.REFERENCE)
+    if not view.recording.has(names.SIM_LINK_STATES):
         return _tracking_panels(view, [('estimate', pair(estimate, reference, LINK_NAMES))], 1)[0]
-    truth = view.series('sim/link_states')
+    truth = view.series(names.SIM_LINK_STATES)
     figure, panels = _tracking_panels(view, [
         ('estimate', pair(estimate, reference, LINK_NAMES)),
         ('ground truth', pair(truth, reference, LINK_NAMES))], 3)
@@ -263,8 +264,8 @@ def _tracking_panels(view: View, actual: list[tuple[str, Paired]],
 
 
 def _sigma_band(view: View, axes: Axes, link: int) -> None:
-    if view.recording.has('estimate/sigma'):
-        sigma = view.series('estimate/sigma')
+    if view.recording.has(names.ESTIMATE_SIGMA):
+        sigma = view.series(names.ESTIMATE_SIGMA)
         time, width = decimate(view.seconds(sigma.stamp_ns), np.degrees(
             2.0 * sigma.select(LINK_NAMES).position[:, link]), bins=150)
         axes.fill_between(time, -width, width, color=COLOURS['muted'], alpha=0.22, linewidth=0,
@@ -275,9 +276,9 @@ def wheels(view: View) -> Figure:
     """Plot wheel speeds and motor torques, with the limits of the motors where in view."""
     figure = Figure(figsize=(style.WIDTH_IN, 4.6), layout='constrained')
     speed_axes, torque_axes = figure.subplots(2, 1, sharex=True)
-    truth = view.recording.has('sim/flywheel_states')
-    speeds = view.series('sim/flywheel_states' if truth else 'flywheel_states')
-    states = view.series('flywheel_states').select(FLYWHEEL_NAMES)
+    truth = view.recording.has(names.SIM_FLYWHEEL_STATES)
+    speeds = view.series(names.SIM_FLYWHEEL_STATES if truth else names.FLYWHEEL_STATES)
+    states = view.series(names.FLYWHEEL_STATES).select(FLYWHEEL_NAMES)
     limits = (None, None) if view.mechanism is None else (
         view.mechanism.motor_speed_limits, view.mechanism.motor_torque_limits)
     _four_curves(view, speed_axes, speeds.stamp_ns, speeds.select(FLYWHEEL_NAMES).velocity,
@@ -333,7 +334,7 @@ def energy(view: View) -> Figure:
     except BagError as error:
         reasons.append(error)
     try:
-        series = view.series('energy').select(('flywheel_energy_j', 'eq9_j_s', 'work_j'))
+        series = view.series(names.ENERGY).select(('flywheel_energy_j', 'eq9_j_s', 'work_j'))
         curves += [(column, 'controller', series.stamp_ns, series.position[:, column],
                     {'color': COLOURS['ink'], 'linewidth': 1.3}) for column in range(3)]
     except BagError as error:
@@ -360,7 +361,7 @@ def energy(view: View) -> Figure:
 
 def timing(view: View) -> Figure:
     """Plot the round trip over time and its distribution, with the control period."""
-    series = view.series('timing')
+    series = view.series(names.TIMING)
     trips = series.select(('round_trip_s',)).position[:, 0] * 1e3
     known = np.isfinite(trips)
     if not known.any():
@@ -404,7 +405,7 @@ def innovations(view: View) -> Figure:
     """Plot the innovations, and NIS per degree of freedom with its 95 % band."""
     from scipy.special import gammaincinv
 
-    series = view.recording.arrivals('estimate/innovation').between(
+    series = view.recording.arrivals(names.ESTIMATE_INNOVATION).between(
         view.motion.start_ns, view.motion.end_ns)
     nis, degrees = series.select(('nis', 'degrees_of_freedom')).position.T
     used = degrees > 0

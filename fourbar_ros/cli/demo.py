@@ -17,6 +17,7 @@ import shutil
 from typing import Any, TYPE_CHECKING
 
 from fourbar_ros.cli.processes import Processes
+from fourbar_ros.common import names
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.output_files import atomic_file, OutputError
 import yaml
@@ -28,14 +29,15 @@ if TYPE_CHECKING:
 DEVICES = {'simulated': ('plant',), 'prototype': ('prototype_emulator', 'hardware')}
 PRESETS = {'simulated': 'paper', 'prototype': 'prototype'}
 
-STATUSES = ('device_status', 'controller_status')
+STATUSES = (names.DEVICE_STATUS, names.CONTROLLER_STATUS)
 JOINTS = (
-    'link_angles', 'flywheel_states', 'flywheel_command', 'timing', 'sim/link_states',
-    'sim/flywheel_states', 'estimate/link_states', 'estimate/sigma', 'estimate/innovation',
-    'reference', 'tracking_error', 'energy', 'allocation', 'momentum',
+    names.LINK_ANGLES, names.FLYWHEEL_STATES, names.FLYWHEEL_COMMAND, names.TIMING,
+    names.SIM_LINK_STATES, names.SIM_FLYWHEEL_STATES, names.ESTIMATE_LINK_STATES,
+    names.ESTIMATE_SIGMA, names.ESTIMATE_INNOVATION,
+    names.REFERENCE, names.TRACKING_ERROR, names.ENERGY, names.ALLOCATION, names.MOMENTUM,
 )
 
-WATCHED = ('flywheel_states', 'estimate/link_states')
+WATCHED = (names.FLYWHEEL_STATES, names.ESTIMATE_LINK_STATES)
 
 PROGRESS = '|{bar:40}| {n:4.1f} of {total:.1f} s{postfix}'
 TABLE = (
@@ -252,15 +254,16 @@ def _move(testbed: Any, processes: Processes, scenario: Scenario, progress_bar: 
     testbed.follow(*STATUSES)
     testbed.follow_joints(*JOINTS)
     until(lambda: len(testbed.statuses) == len(STATUSES) and len(testbed.joints) == len(JOINTS)
-          and testbed.recorded(('setpoint', *STATUSES, *JOINTS)),
+          and testbed.recorded((names.SETPOINT, *STATUSES, *JOINTS)),
           'the nodes did not find each other')
     # Watching everything would cost the loop as much as a node does.
     testbed.leave_joints(*(set(JOINTS) - set(WATCHED)))
     settled_ns = testbed.stamp_ns() + SETTLE_BEFORE * 1e9
     until(lambda: bool(testbed.stamp_ns() >= settled_ns), 'no ticks came')
-    _demand(*testbed.switch('arm', True))
-    until(lambda: testbed.statuses['device_status']['state'] == 'armed', 'no word of the arming')
-    until(lambda: _armed(testbed) and testbed.statuses['controller_status']['mode'] == 'hold',
+    _demand(*testbed.switch(names.ARM, True))
+    until(lambda: testbed.statuses[names.DEVICE_STATUS]['state'] == 'armed',
+          'no word of the arming')
+    until(lambda: _armed(testbed) and testbed.statuses[names.CONTROLLER_STATUS]['mode'] == 'hold',
           'the controller did not notice the arming')
     setpoint = scenario.setpoints[0]
     accepted, reason = testbed.setpoint(setpoint.names, setpoint.positions)
@@ -277,17 +280,17 @@ def _move(testbed: Any, processes: Processes, scenario: Scenario, progress_bar: 
             _armed(testbed)
             elapsed = (testbed.stamp_ns() - start_ns) * 1e-9
             link = setpoint.names[0]
-            angle = degrees(testbed.positions('estimate/link_states', [link])[0])
+            angle = degrees(testbed.positions(names.ESTIMATE_LINK_STATES, [link])[0])
             bar.set_postfix_str(f'{link} at {angle:.1f} deg', refresh=False)
             bar.update(min(elapsed, duration) - bar.n)
             return bool(elapsed >= duration)
         until(arrived, 'the motion did not end', 3.0 * duration)
-    testbed.switch('arm', False)
+    testbed.switch(names.ARM, False)
 
 
 def _armed(testbed: Any) -> bool:
     """Make sure that the device is still armed, or say why not."""
-    device = testbed.statuses['device_status']
+    device = testbed.statuses[names.DEVICE_STATUS]
     _demand(device['state'] == 'armed', f'the device is {device["state"]}: {device["reason"]}')
     return True
 

@@ -12,19 +12,20 @@ from __future__ import annotations
 import argparse
 
 from fourbar_ros.cli.ros import add_ros_arguments, report_verdict, testbed_client
+from fourbar_ros.common import names
 from fourbar_ros.common.errors import FourbarError
 
 DEVICE = {
-    'arm': lambda testbed: testbed.switch('arm', True),
-    'disarm': lambda testbed: testbed.switch('arm', False),
-    'stop': lambda testbed: testbed.trigger('emergency_stop'),
-    'reset': lambda testbed: testbed.trigger('reset_emergency_stop'),
+    'arm': lambda testbed: testbed.switch(names.ARM, True),
+    'disarm': lambda testbed: testbed.switch(names.ARM, False),
+    'stop': lambda testbed: testbed.trigger(names.EMERGENCY_STOP),
+    'reset': lambda testbed: testbed.trigger(names.RESET_EMERGENCY_STOP),
 }
 CONTROLLER = {
-    'enable': lambda testbed: testbed.switch('enable', True, of='controller'),
-    'disable': lambda testbed: testbed.switch('enable', False, of='controller'),
-    'hold': lambda testbed: testbed.trigger('hold', of='controller'),
-    'damp': lambda testbed: testbed.trigger('damp', of='controller'),
+    'enable': lambda testbed: testbed.switch(names.ENABLE, True, of='controller'),
+    'disable': lambda testbed: testbed.switch(names.ENABLE, False, of='controller'),
+    'hold': lambda testbed: testbed.trigger(names.HOLD, of='controller'),
+    'damp': lambda testbed: testbed.trigger(names.DAMP, of='controller'),
 }
 
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 import argparse
 
 from fourbar_ros.cli.ros import add_ros_arguments, report_verdict, testbed_client
+from fourbar_ros.common import names
 
 CALLS = {
-    'pause': lambda testbed: testbed.switch('sim/pause', True),
-    'resume': lambda testbed: testbed.switch('sim/pause', False),
-    'step': lambda testbed: testbed.trigger('sim/step'),
-    'reset': lambda testbed: testbed.trigger('sim/reset'),
+    'pause': lambda testbed: testbed.switch(names.SIM_PAUSE, True),
+    'resume': lambda testbed: testbed.switch(names.SIM_PAUSE, False),
+    'step': lambda testbed: testbed.trigger(names.SIM_STEP),
+    'reset': lambda testbed: testbed.trigger(names.SIM_RESET),
 }
 
 EPILOG = """\

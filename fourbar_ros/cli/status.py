@@ -8,8 +8,9 @@ from __future__ import annotations
 import argparse
 
 from fourbar_ros.cli.ros import add_ros_arguments, REFUSED, testbed_client
+from fourbar_ros.common import names
 
-SOURCES = {'device': 'device_status', 'controller': 'controller_status'}
+SOURCES = {'device': names.DEVICE_STATUS, 'controller': names.CONTROLLER_STATUS}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

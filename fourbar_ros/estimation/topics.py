@@ -14,6 +14,19 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from fourbar_ros.common.named_values import RejectedError
+from fourbar_ros.common.names import (
+    ESTIMATE_COVARIANCE,
+    ESTIMATE_DECISIONS,
+    ESTIMATE_DISTURBANCE,
+    ESTIMATE_GYRO_BIAS,
+    ESTIMATE_INNOVATION,
+    ESTIMATE_LINK_STATES,
+    ESTIMATE_SIGMA,
+    ESTIMATE_WAITING,
+    FLYWHEEL_COMMAND,
+    FLYWHEEL_STATES,
+    LINK_ANGLES,
+)
 from fourbar_ros.estimation.estimate import ACCEPTED, Estimate
 from fourbar_ros.estimation.estimator import BY_COMMAND, BY_NOTHING, Estimator, STATE_NAMES
 from fourbar_ros.estimation.measurement import sensor_name
@@ -29,9 +42,8 @@ COVARIANCES = tuple(
 DISTURBANCES = ('torque_a', 'torque_b', 'sigma_a', 'sigma_b')
 UPPER = np.triu_indices(len(STATE_NAMES))
 
-MEASURED, TICK, COMMAND = 'link_angles', 'flywheel_states', 'flywheel_command'
-INPUTS = (MEASURED, TICK)
-"""Topics that the estimator subscribes to, all JointState; to COMMAND only where it must."""
+INPUTS = (LINK_ANGLES, FLYWHEEL_STATES)
+"""JointState topics of the estimator; FLYWHEEL_COMMAND only while `needs_commands`."""
 
 
 class Output(NamedTuple):
@@ -50,25 +62,22 @@ class Output(NamedTuple):
     optional: bool = False
 
 
-STATES, INNOVATION = 'estimate/link_states', 'estimate/innovation'
 OUTPUTS = {
-    STATES: Output(LINK_NAMES, ('position', 'velocity', 'effort'), frame='table'),
-    'estimate/sigma': Output(LINK_NAMES),
-    'estimate/covariance': Output(COVARIANCES, ('position',)),
-    'estimate/disturbance': Output(DISTURBANCES, ('position',)),
-    'estimate/gyro_bias': Output(LINK_NAMES, ('velocity',), optional=True),
-    'estimate/decisions': Output(LINK_NAMES, ('position', 'velocity', 'effort')),
-    INNOVATION: Output(('nis', 'degrees_of_freedom', *LINK_NAMES), ('position',)),
+    ESTIMATE_LINK_STATES: Output(LINK_NAMES, ('position', 'velocity', 'effort'), frame='table'),
+    ESTIMATE_SIGMA: Output(LINK_NAMES),
+    ESTIMATE_COVARIANCE: Output(COVARIANCES, ('position',)),
+    ESTIMATE_DISTURBANCE: Output(DISTURBANCES, ('position',)),
+    ESTIMATE_GYRO_BIAS: Output(LINK_NAMES, ('velocity',), optional=True),
+    ESTIMATE_DECISIONS: Output(LINK_NAMES, ('position', 'velocity', 'effort')),
+    ESTIMATE_INNOVATION: Output(('nis', 'degrees_of_freedom', *LINK_NAMES), ('position',)),
 }
-WAITING = 'estimate/waiting'
-"""The topic, of type Header, that answers a tick for which there is no estimate."""
 
 
 class Message(NamedTuple):
     """
     What is to be published.
 
-    :param topic: of `OUTPUTS`, or `WAITING`, which has a stamp and nothing else.
+    :param topic: of `OUTPUTS`, or `ESTIMATE_WAITING`, which has a stamp and nothing else.
     :param stamp_ns: of the header [ns].
     :param names: k of them.
     :param values: an array (k,) for each of the topic's fields.
@@ -109,13 +118,13 @@ class EstimatorTopics:
         """
         Take a message; one that is of no use is counted, and changes nothing.
 
-        :param topic: one of `INPUTS`, or COMMAND.
+        :param topic: one of `INPUTS`, or FLYWHEEL_COMMAND.
         :param stamp_ns: of the header [ns].
         :param names, position, velocity, effort: as they are in the message.
         """
-        if topic == TICK:
+        if topic == FLYWHEEL_STATES:
             return self._tick(stamp_ns, names, velocity, effort)
-        if topic == COMMAND:
+        if topic == FLYWHEEL_COMMAND:
             if tuple(names) == FLYWHEEL_NAMES:
                 self.estimator.commanded(effort)
             return Answer()
@@ -142,7 +151,7 @@ class EstimatorTopics:
                 raise error
             estimate = self.estimator.tick(stamp_ns, velocity, effort)
         except RejectedError as error:
-            return Answer((Message(WAITING, stamp_ns),), str(error))
+            return Answer((Message(ESTIMATE_WAITING, stamp_ns),), str(error))
         self._last = stamp_ns, estimate
         return Answer(messages_of(self.estimator, stamp_ns, estimate))
 
@@ -155,26 +164,26 @@ def messages_of(estimator: Estimator, stamp_ns: int, estimate: Estimate | None
     :param estimator: at that tick.
     """
     if estimate is None:
-        yield Message(WAITING, stamp_ns)
+        yield Message(ESTIMATE_WAITING, stamp_ns)
         return
-    yield Message(STATES, stamp_ns, LINK_NAMES, (
+    yield Message(ESTIMATE_LINK_STATES, stamp_ns, LINK_NAMES, (
         estimate.link_angles, estimate.link_rates, estimate.link_torques))
-    yield Message('estimate/sigma', stamp_ns, LINK_NAMES,
+    yield Message(ESTIMATE_SIGMA, stamp_ns, LINK_NAMES,
                   (estimate.angle_sigmas, estimate.rate_sigmas))
-    yield Message('estimate/covariance', stamp_ns, COVARIANCES, (estimate.covariance[UPPER],))
-    yield Message('estimate/disturbance', stamp_ns, DISTURBANCES, (
+    yield Message(ESTIMATE_COVARIANCE, stamp_ns, COVARIANCES, (estimate.covariance[UPPER],))
+    yield Message(ESTIMATE_DISTURBANCE, stamp_ns, DISTURBANCES, (
         np.concatenate([estimate.disturbance, estimate.disturbance_sigmas]),))
     if estimate.gyro_biases:
-        yield Message('estimate/gyro_bias', stamp_ns,
+        yield Message(ESTIMATE_GYRO_BIAS, stamp_ns,
                       tuple(SENSOR_NAMES[sensor] for sensor in estimate.gyro_biases), (
                           np.array(list(estimate.gyro_biases.values())),))
     if decisions := estimator.decisions():
         sensors, reasons, squares = zip(*decisions)
         accepted = np.array(reasons) == ACCEPTED
-        yield Message('estimate/decisions', stamp_ns,
+        yield Message(ESTIMATE_DECISIONS, stamp_ns,
                       tuple(SENSOR_NAMES[sensor] for sensor in sensors), (
                           np.array(reasons, float), np.array(squares), accepted.astype(float)))
     if (seen := estimate.innovation) is not None:
         names = ('nis', 'degrees_of_freedom', *map(sensor_name, seen.sensors))
-        yield Message(INNOVATION, stamp_ns, names, (
+        yield Message(ESTIMATE_INNOVATION, stamp_ns, names, (
             np.array([seen.nis, seen.degrees_of_freedom, *seen.values]),))

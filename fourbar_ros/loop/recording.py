@@ -8,6 +8,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Iterator, Sequence
 
+from fourbar_ros.common import names
 from fourbar_ros.control.actuation_cost import ENERGIES
 from fourbar_ros.control.wheel_command import WheelCommand
 from fourbar_ros.loop.closed_loop import Step
@@ -21,29 +22,29 @@ QUALITY = ('nis', 'degrees_of_freedom')
 LINKS = tuple('abcd')
 # Of the table: the beginning of the names of the columns, topic, field, and how the names end.
 COLUMNS = (
-    ('flywheel_angle_', 'flywheel_states', 'position', LINKS),
-    ('flywheel_speed_', 'flywheel_states', 'velocity', LINKS),
-    ('flywheel_effort_', 'flywheel_states', 'effort', LINKS),
-    ('true_link_', 'sim/link_states', 'position', LINKS),
-    ('true_rate_', 'sim/link_states', 'velocity', LINKS),
-    ('true_flywheel_angle_', 'sim/flywheel_states', 'position', LINKS),
-    ('true_flywheel_speed_', 'sim/flywheel_states', 'velocity', LINKS),
-    ('true_flywheel_effort_', 'sim/flywheel_states', 'effort', LINKS),
-    ('estimate_link_', 'estimate/link_states', 'position', LINKS),
-    ('estimate_rate_', 'estimate/link_states', 'velocity', LINKS),
-    ('sigma_link_', 'estimate/sigma', 'position', LINKS),
-    ('sigma_rate_', 'estimate/sigma', 'velocity', LINKS),
-    ('', 'estimate/innovation', 'position',
+    ('flywheel_angle_', names.FLYWHEEL_STATES, 'position', LINKS),
+    ('flywheel_speed_', names.FLYWHEEL_STATES, 'velocity', LINKS),
+    ('flywheel_effort_', names.FLYWHEEL_STATES, 'effort', LINKS),
+    ('true_link_', names.SIM_LINK_STATES, 'position', LINKS),
+    ('true_rate_', names.SIM_LINK_STATES, 'velocity', LINKS),
+    ('true_flywheel_angle_', names.SIM_FLYWHEEL_STATES, 'position', LINKS),
+    ('true_flywheel_speed_', names.SIM_FLYWHEEL_STATES, 'velocity', LINKS),
+    ('true_flywheel_effort_', names.SIM_FLYWHEEL_STATES, 'effort', LINKS),
+    ('estimate_link_', names.ESTIMATE_LINK_STATES, 'position', LINKS),
+    ('estimate_rate_', names.ESTIMATE_LINK_STATES, 'velocity', LINKS),
+    ('sigma_link_', names.ESTIMATE_SIGMA, 'position', LINKS),
+    ('sigma_rate_', names.ESTIMATE_SIGMA, 'velocity', LINKS),
+    ('', names.ESTIMATE_INNOVATION, 'position',
      (*QUALITY, *(f'innovation_{kind}{name}' for kind in ('', 'gyro_')
                   for name in (*LINKS, *JOINT_NAMES)))),
-    ('disturbance_', 'estimate/disturbance', 'position', ('a', 'b', 'sigma_a', 'sigma_b')),
-    ('reference_link_', 'reference', 'position', LINKS),
-    ('reference_rate_', 'reference', 'velocity', LINKS),
-    ('error_link_', 'tracking_error', 'position', LINKS),
-    ('error_rate_', 'tracking_error', 'velocity', LINKS),
-    ('', 'energy', 'position', ENERGIES),
-    ('command_', 'flywheel_command', 'effort', LINKS),
-    ('command_speed_', 'flywheel_command', 'velocity', LINKS),
+    ('disturbance_', names.ESTIMATE_DISTURBANCE, 'position', ('a', 'b', 'sigma_a', 'sigma_b')),
+    ('reference_link_', names.REFERENCE, 'position', LINKS),
+    ('reference_rate_', names.REFERENCE, 'velocity', LINKS),
+    ('error_link_', names.TRACKING_ERROR, 'position', LINKS),
+    ('error_rate_', names.TRACKING_ERROR, 'velocity', LINKS),
+    ('', names.ENERGY, 'position', ENERGIES),
+    ('command_', names.FLYWHEEL_COMMAND, 'effort', LINKS),
+    ('command_speed_', names.FLYWHEEL_COMMAND, 'velocity', LINKS),
 )
 
 
@@ -73,34 +74,34 @@ class Recording:
             places = [self.sensor_names.index(name) for name in sample.names]
             width = len(self.sensor_names)
             rates = {'velocity': _spread(places, sample.rates, width)} if sample.rates.size else {}
-            self._row('link_angles', sample.stamp_ns, now,
+            self._row(names.LINK_ANGLES, sample.stamp_ns, now,
                       position=_spread(places, sample.angles, width), **rates)
         wheels = samples.wheels
-        self._row('flywheel_states', now, now, position=wheels.angles, velocity=wheels.speeds,
+        self._row(names.FLYWHEEL_STATES, now, now, position=wheels.angles, velocity=wheels.speeds,
                   effort=wheels.efforts)
         if (truth := samples.truth) is not None:
-            self._row('sim/link_states', now, now, position=truth.link_angles,
+            self._row(names.SIM_LINK_STATES, now, now, position=truth.link_angles,
                       velocity=truth.link_rates)
-            self._row('sim/flywheel_states', now, now, position=truth.wheel_angles,
+            self._row(names.SIM_FLYWHEEL_STATES, now, now, position=truth.wheel_angles,
                       velocity=truth.wheel_speeds, effort=truth.efforts)
         if (estimate := step.estimate) is not None:
-            self._row('estimate/link_states', now, now, position=estimate.link_angles,
+            self._row(names.ESTIMATE_LINK_STATES, now, now, position=estimate.link_angles,
                       velocity=estimate.link_rates, effort=estimate.link_torques)
-            self._row('estimate/sigma', now, now, position=estimate.angle_sigmas,
+            self._row(names.ESTIMATE_SIGMA, now, now, position=estimate.angle_sigmas,
                       velocity=estimate.rate_sigmas)
-            self._row('estimate/disturbance', now, now, position=np.concatenate(
+            self._row(names.ESTIMATE_DISTURBANCE, now, now, position=np.concatenate(
                 [estimate.disturbance, estimate.disturbance_sigmas]))
             if (seen := estimate.innovation) is not None:
-                self._row('estimate/innovation', now, now, position=np.concatenate(
+                self._row(names.ESTIMATE_INNOVATION, now, now, position=np.concatenate(
                     [[seen.nis, seen.degrees_of_freedom],
                      _spread(seen.sensors, seen.values, 2 * len(SENSOR_NAMES))]))
         if (control := step.control) is not None:
             self._command(now, control.command)
-            self._row('reference', now, now, position=control.reference_angles,
+            self._row(names.REFERENCE, now, now, position=control.reference_angles,
                       velocity=control.reference_rates)
-            self._row('tracking_error', now, now, position=control.angle_errors,
+            self._row(names.TRACKING_ERROR, now, now, position=control.angle_errors,
                       velocity=control.rate_errors)
-            self._row('energy', now, now, position=control.energies)
+            self._row(names.ENERGY, now, now, position=control.energies)
 
     def arrays(self) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]:
         """Return copies of all arrays by name."""
@@ -124,31 +125,31 @@ class Recording:
         found = self.arrays()
         ticks_ns = np.array(self.tick_stamps_ns, dtype=np.int64)
         first_ns = int(ticks_ns[0]) if len(ticks_ns) else 0
-        names = ['t']
+        titles = ['t']
         columns: list[Array] = [np.array(ticks_ns - first_ns, dtype=float)[:, None] / 1e9]
         sensors = len(self.sensor_names)
         measured = np.full((len(ticks_ns), 2 * sensors), np.nan)
-        rows = self._ticks_of('link_angles', found)
+        rows = self._ticks_of(names.LINK_ANGLES, found)
         for n, row in enumerate(rows):
             angles = found['link_angles.position'][n]
             given = np.flatnonzero(~np.isnan(angles))
             measured[row, given] = angles[given]
             measured[row, sensors + given] = (found['link_angles.stamp_ns'][n] - first_ns) / 1e9
-        names += [f'measured_{name}' for name in self.sensor_names]
-        names += [f'measured_at_{name}' for name in self.sensor_names]
+        titles += [f'measured_{name}' for name in self.sensor_names]
+        titles += [f'measured_at_{name}' for name in self.sensor_names]
         columns.append(measured)
         for prefix, topic, field, ends in COLUMNS:
-            names += [f'{prefix}{end}' for end in ends]
+            titles += [f'{prefix}{end}' for end in ends]
             column = np.full((len(ticks_ns), len(ends)), np.nan)
             if f'{topic}.{field}' in found:
                 column[self._ticks_of(topic, found)] = found[f'{topic}.{field}']
             columns.append(column)
-        return tuple(names), np.hstack(columns)
+        return tuple(titles), np.hstack(columns)
 
     def lines(self) -> Iterator[str]:
         """Write the table as CSV: 17 significant digits, nothing where there is no number."""
-        names, table = self.table()
-        yield ','.join(names) + '\n'
+        titles, table = self.table()
+        yield ','.join(titles) + '\n'
         for row in table:
             # Only NaN differs from itself.
             yield ','.join(['%.17g' % value if value == value else ''
@@ -165,7 +166,7 @@ class Recording:
         values = np.where(command.powered, command.values, np.nan)
         nothing = np.full(len(values), np.nan)
         efforts, velocities = (nothing, values) if command.by_speed else (values, nothing)
-        self._row('flywheel_command', now, now, effort=efforts, velocity=velocities)
+        self._row(names.FLYWHEEL_COMMAND, now, now, effort=efforts, velocity=velocities)
 
     def _row(self, topic: str, stamp_ns: int, tick_ns: int, **values: Array) -> None:
         if topic not in self._stamps:

@@ -6,6 +6,7 @@
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from fourbar_ros.common.names import CONTROLLER_STATUS, DEVICE_STATUS, FLYWHEEL_STATES, SETPOINT
 from fourbar_ros.operator.service_call import ServiceCall
 from fourbar_ros.ros.environment import RosError
 from fourbar_ros.ros.messages import LATCHED, RELIABLE, SENSOR, stamp_of
@@ -91,7 +92,7 @@ class TestbedClient:
         for topic in topics:
             self.node.destroy_subscription(self._followed.pop(topic))
 
-    def stamp_ns(self, topic='flywheel_states'):
+    def stamp_ns(self, topic=FLYWHEEL_STATES):
         """Return the newest stamp of a followed topic [ns], None before the first."""
         return stamp_of(self.joints[topic]) if topic in self.joints else None
 
@@ -102,7 +103,7 @@ class TestbedClient:
 
     def device_visible(self):
         """Tell whether any device publishes its status here."""
-        return self.node.count_publishers(self.node.resolve_topic_name('device_status')) > 0
+        return self.node.count_publishers(self.node.resolve_topic_name(DEVICE_STATUS)) > 0
 
     def recorded(self, topics):
         """Tell whether a recorder subscribes to all of these topics."""
@@ -140,7 +141,7 @@ class TestbedClient:
     def offer_setpoints(self):
         """Become a publisher of setpoints, so that others can find it before the first one."""
         if self._setpoints is None:
-            self._setpoints = self.node.create_publisher(JointState, 'setpoint', RELIABLE)
+            self._setpoints = self.node.create_publisher(JointState, SETPOINT, RELIABLE)
 
     def setpoint(self, names, positions):
         """
@@ -149,21 +150,21 @@ class TestbedClient:
         :returns: whether it was accepted, and why not.
         :raises RosError: no device, no controller, or no verdict.
         """
-        self.follow('controller_status')
-        self.follow_joints('flywheel_states')
+        self.follow(CONTROLLER_STATUS)
+        self.follow_joints(FLYWHEEL_STATES)
         self.offer_setpoints()
         self.wait(lambda: self.stamp_ns() is not None,
                   missing='no device found: no flywheel_states came')
         self.wait(lambda: (self.node.count_subscribers(self._setpoints.topic_name) > 0
-                           and 'controller_status' in self.statuses),
+                           and CONTROLLER_STATUS in self.statuses),
                   missing='no controller found: nobody takes setpoint')
         # The newest tick is a stamp that nobody can call stale, and tells our verdict from others.
         stamp_ns = self.stamp_ns()
         message = JointState(name=list(names), position=list(positions))
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
-        refused = self.statuses['controller_status']['refused']
+        refused = self.statuses[CONTROLLER_STATUS]['refused']
         self._setpoints.publish(message)
-        self.wait(lambda: self.statuses['controller_status']['judged_stamp_ns'] == str(stamp_ns),
+        self.wait(lambda: self.statuses[CONTROLLER_STATUS]['judged_stamp_ns'] == str(stamp_ns),
                   missing='no verdict from the controller')
-        status = self.statuses['controller_status']
+        status = self.statuses[CONTROLLER_STATUS]
         return status['refused'] == refused, status['last_refusal']

@@ -6,6 +6,7 @@
 import gc
 from math import inf
 
+from fourbar_ros.common import names
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.mechanism import FLYWHEEL_NAMES
 from fourbar_ros.operator.experiment import Experiment
@@ -48,10 +49,10 @@ class DrivenExperiment(Experiment):
         gc.collect()
         gc.freeze()     # a search for garbage outlasts a command timeout
         go_first()
-        topic = self.node.resolve_topic_name('flywheel_command')
+        topic = self.node.resolve_topic_name(names.FLYWHEEL_COMMAND)
         if self.testbed.wait(lambda: self.node.count_publishers(topic), LOOK_AROUND):
             raise RosError(f'{topic} has a publisher already: stop the controller')
-        self._commands = self.node.create_publisher(JointState, 'flywheel_command', RELIABLE)
+        self._commands = self.node.create_publisher(JointState, names.FLYWHEEL_COMMAND, RELIABLE)
         try:
             self.testbed.wait(lambda: self._commands.get_subscription_count() > 0,
                               missing=f'nobody takes {topic}')
@@ -88,9 +89,9 @@ class DrivenExperiment(Experiment):
             self._publish(efforts or dict.fromkeys(FLYWHEEL_NAMES, 0.0))
 
     def _arm(self):
-        armed, message = self.testbed.switch('arm', True)
+        armed, message = self.testbed.switch(names.ARM, True)
         if not armed:
-            hint = ': stop the controller' if 'flywheel_command' in message else ''
+            hint = ': stop the controller' if names.FLYWHEEL_COMMAND in message else ''
             raise RosError(f'the device does not arm: {message}{hint}')
         self.testbed.wait(lambda: self.status['state'] == 'armed',
                           missing='the device was not armed')
@@ -121,7 +122,7 @@ class DrivenExperiment(Experiment):
         try:
             if self.tick is not None:
                 self._publish(dict.fromkeys(FLYWHEEL_NAMES, 0.0))
-            self.testbed.switch('arm', False)
+            self.testbed.switch(names.ARM, False)
         except RosError as error:
             raise RosError(f'{error}: could not disarm, without commands the device stops by '
                            'itself') from None

@@ -8,6 +8,7 @@ from math import inf
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from fourbar_ros.common import names
 from fourbar_ros.mechanism import LINK_NAMES
 from fourbar_ros.operator.recorder import offered_qos, QUEUE_DEPTH
 from fourbar_ros.ros.environment import RosError
@@ -42,9 +43,9 @@ class Experiment:
         self._heard_at = time.monotonic()
         guard = testbed.runtime.guard
         for topic, kind, qos, callback in (
-                ('device_status', DiagnosticStatus, LATCHED, self.on_status),
-                ('link_angles', JointState, DEEP, self.on_links),
-                ('flywheel_states', JointState, DEEP, self.on_tick)):
+                (names.DEVICE_STATUS, DiagnosticStatus, LATCHED, self.on_status),
+                (names.LINK_ANGLES, JointState, DEEP, self.on_links),
+                (names.FLYWHEEL_STATES, JointState, DEEP, self.on_tick)):
             self.node.create_subscription(
                 kind, topic, guard(partial(self._take, topic, kind, callback)), qos, raw=True)
 
@@ -78,7 +79,7 @@ class Experiment:
                 raise RosError('the device is armed: disarm it, the links must rest')
             return time.monotonic() - begin >= seconds
         self.testbed.wait(listened, inf)
-        if not any(topic == 'link_angles' for topic, *_ in self._kept):
+        if not any(topic == names.LINK_ANGLES for topic, *_ in self._kept):
             raise RosError(f'no link_angles came in {seconds:g} s')
 
     def begin(self):

@@ -6,6 +6,8 @@
 from math import inf
 import time
 
+from fourbar_ros.common import names
+
 # Who waits for so long asks again [s].
 ASK_AGAIN = 1.0
 
@@ -13,10 +15,11 @@ ASK_AGAIN = 1.0
 # between. `sim/step` is none, and to arm, to enable or to release a stop is none, either: somebody
 # else may have disarmed or stopped meanwhile.
 REPEATABLE = frozenset(
-    {'damp', 'emergency_stop', 'estimate/reset', 'hold', 'sim/pause', 'sim/reset'})
+    {names.DAMP, names.EMERGENCY_STOP, names.ESTIMATE_RESET, names.HOLD,
+     names.SIM_PAUSE, names.SIM_RESET})
 
 # Likewise, if they are asked for no.
-REPEATABLE_NO = frozenset({'arm', 'enable'})
+REPEATABLE_NO = frozenset({names.ARM, names.ENABLE})
 
 # What is asked once is asked so much later, when the server knows who asks [s].
 ACQUAINTED_AFTER = 0.2

@@ -5,10 +5,16 @@
 
 from functools import partial
 
+from fourbar_ros.common.names import (
+    ESTIMATE_RESET,
+    ESTIMATE_WAITING,
+    FLYWHEEL_COMMAND,
+    FLYWHEEL_STATES,
+)
 from fourbar_ros.estimation import EstimatorSettings
 from fourbar_ros.estimation.estimator import BY_SPEED
 from fourbar_ros.estimation.parameters import PARAMETERS
-from fourbar_ros.estimation.topics import COMMAND, EstimatorTopics, INPUTS, OUTPUTS, TICK, WAITING
+from fourbar_ros.estimation.topics import EstimatorTopics, INPUTS, OUTPUTS
 from fourbar_ros.mechanism import load_mechanism
 from fourbar_ros.ros.messages import (
     Diagnostics,
@@ -48,8 +54,8 @@ class EstimatorNode(Node):
         for topic, output in OUTPUTS.items():
             if not output.optional:
                 self._offer(topic)
-        self._waiting = self.create_publisher(Header, WAITING, RELIABLE)
-        self.create_service(Trigger, 'estimate/reset', runtime.guard(self._on_reset))
+        self._waiting = self.create_publisher(Header, ESTIMATE_WAITING, RELIABLE)
+        self.create_service(Trigger, ESTIMATE_RESET, runtime.guard(self._on_reset))
         self._diagnostics = Diagnostics(self, '', self._collect, runtime.guard)
         for topic in INPUTS:
             self._listen(topic)
@@ -73,7 +79,7 @@ class EstimatorNode(Node):
             self._log.warn(f'{topic} rejected: {answer.rejection}')
         for published in answer.messages:
             self._publish(published)
-        if topic == TICK and not answer.rejection:
+        if topic == FLYWHEEL_STATES and not answer.rejection:
             self._tell_starts()
             self._ticks += 1
             if self._ticks % LOOK_EVERY == 0:
@@ -81,7 +87,7 @@ class EstimatorNode(Node):
             if self._topics.needs_commands and not self._listens_to_commands:
                 # Only here: these messages cost time at every tick.
                 self._listens_to_commands = True
-                self._listen(COMMAND)
+                self._listen(FLYWHEEL_COMMAND)
 
     def _tell_starts(self):
         starts = self._estimator.starts
@@ -91,7 +97,7 @@ class EstimatorNode(Node):
                 'started' if starts == 1 else f'acquired the linkage anew, start {starts}')
 
     def _publish(self, message):
-        if message.topic == WAITING:
+        if message.topic == ESTIMATE_WAITING:
             stamp = Header()
             stamp.stamp.sec, stamp.stamp.nanosec = divmod(message.stamp_ns, 1_000_000_000)
             self._waiting.publish(stamp)

@@ -30,6 +30,7 @@ from fourbar_ros.analysis.calibration.wheels import (
     wheel_estimate,
     wheels_moved,
 )
+from fourbar_ros.common import names
 from fourbar_ros.common.checks import at_most, Check
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism
 import numpy as np
@@ -73,8 +74,8 @@ def mechanism_name_in(recording: Recording) -> str:
 
     :raises BagError: it did not.
     """
-    if recording.has('device_status'):
-        for status in reversed(recording.statuses('device_status')):
+    if recording.has(names.DEVICE_STATUS):
+        for status in reversed(recording.statuses(names.DEVICE_STATUS)):
             if name := status.values.get('mechanism'):
                 return name
     raise BagError(f'{recording.path}: no device_status that names a mechanism: give --mechanism')

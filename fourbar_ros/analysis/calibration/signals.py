@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from fourbar_ros.analysis.bags import Floats, JointSeries, Nanoseconds, Recording
 from fourbar_ros.analysis.calibration.quantity import CalibrationError
+from fourbar_ros.common import names
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, JOINT_NAMES, LINK_NAMES
 import numpy as np
 
@@ -66,7 +67,7 @@ def links_in(recording: Recording, origin_ns: int | None = None) -> LinkSignal:
     :raises BagError: there are none.
     :raises CalibrationError: a link has no absolute sensor, or never gave a sample.
     """
-    series = recording.joint_states('link_angles')
+    series = recording.joint_states(names.LINK_ANGLES)
     joints = [name for name in series.names if name in JOINT_NAMES]
     if joints:
         raise CalibrationError(
@@ -89,7 +90,7 @@ def signals_in(recording: Recording) -> tuple[LinkSignal, WheelSignal]:
     :raises BagError: a topic is missing.
     :raises CalibrationError: a link or a wheel is missing.
     """
-    wheels: JointSeries = recording.joint_states('flywheel_states').select(FLYWHEEL_NAMES)
+    wheels: JointSeries = recording.joint_states(names.FLYWHEEL_STATES).select(FLYWHEEL_NAMES)
     for field in ('position', 'velocity', 'effort'):
         if not np.isfinite(getattr(wheels, field)).all():
             raise CalibrationError(f'{wheels.topic} leaves out a {field}')
