@@ -10,7 +10,11 @@ from typing import Any
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.mechanism import load_mechanism, Mechanism
 from hypothesis import settings
+import numpy as np
+from numpy.typing import NDArray
 import pytest
+
+Array = NDArray[np.float64]
 
 # How long an example takes is no law of nature: other tests run on the same machine.
 settings.register_profile('patient', deadline=None)
@@ -30,6 +34,31 @@ def uneven() -> Mechanism:
         [0.12, 0.08, 0.11, 0.10], [0.02, 0.03, 0.025, 0.018], [2.2e-5, 1.5e-5, 3e-5, 1.8e-5],
         [[0.05, 0.01], [0.04, -0.01], [0.06, 0.005], [0.05, 0.0]], [3e-7, 4e-7, 5e-7, 2e-7],
         [1e-4] * 4, [500.0] * 4)
+
+
+@pytest.fixture(scope='session')
+def momentum_and_energy() -> Callable[[Mechanism, Array, Array, Array], tuple[float, float]]:
+    """
+    Return a function that sums angular momentum and kinetic energy over links and wheels.
+
+    Its arguments are mechanism, link angles, link rates and absolute wheel speeds; both sums are
+    about the mass centre of the whole linkage.
+    """
+    def sums(mechanism: Mechanism, angles: Array, rates: Array, wheels: Array
+             ) -> tuple[float, float]:
+        mass, turn, motion = mechanism.link_masses, np.exp(1j * angles), []
+        for unit in (turn, 1j * rates * turn):
+            arm, rod = mechanism.com_positions @ [1.0, 1j] * unit, mechanism.link_lengths * unit
+            at = arm + [0.0, 0.0, rod[1], rod[0]]
+            motion.append(at - mass @ at / mass.sum())
+        place, velocity = motion
+        momentum = (mechanism.link_inertias @ rates + mechanism.flywheel_inertias @ wheels
+                    + mass @ (place.conj() * velocity).imag)
+        energy = (mechanism.link_inertias @ rates**2 + mechanism.flywheel_inertias @ wheels**2
+                  + mass @ np.abs(velocity)**2) / 2.0
+        return float(momentum), float(energy)
+
+    return sums
 
 
 @contextmanager

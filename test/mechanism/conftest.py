@@ -1,19 +1,30 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Random linkages, and motion without torque, for every test of the mechanism."""
+"""Random linkages, motion without torque and the equations of Kane's method, for the tests."""
 
 from collections.abc import Callable
+from typing import Any
 
 from fourbar_ros.mechanism import assemble, Mechanism, reduced_form
 from fourbar_ros.mechanism.forces import NOTHING
 from fourbar_ros.mechanism.integration import move_with_cosines
-from fourbar_ros.mechanism.state import make_state, WHEEL_ANGLES
+from fourbar_ros.mechanism.state import (
+    CENTRE_POSITION,
+    CENTRE_VELOCITY,
+    JOINT_GAP_RATES,
+    JOINT_GAPS,
+    LINK_ANGLES,
+    LINK_RATES,
+    make_state,
+    WHEEL_ANGLES,
+)
 import numpy as np
 from numpy.typing import NDArray
 import pytest
 
 Array = NDArray[np.float64]
+NONE = [0.0] * 4
 
 
 def _random_bodies(rng: np.random.Generator, lengths: Array) -> Mechanism:
@@ -97,3 +108,131 @@ def random_state() -> Callable[..., Array]:
 def move_freely() -> Callable[..., Array]:
     """Integrate without torque."""
     return _move_freely
+
+
+# --- The independent derivation ---------------------------------------------------------------
+
+def _chain(linkage: Mechanism, angles: Array, gaps: Array) -> Array:
+    """
+    Place the mass centres along the chain a, b, c, d, from that of link a.
+
+    :param angles: (4,), as complex numbers of size one, or their time derivatives.
+    :param gaps: (3,) of joints 1 to 3, likewise.
+    :returns: (4,) complex [m].
+    """
+    arm, rod = linkage.com_positions @ [1.0, 1j] * angles, linkage.link_lengths * angles
+    joints = -arm[0] + np.cumsum([gaps[0], rod[1] + gaps[1], rod[2] + gaps[2]])
+    places: Array = np.array([0.0, joints[0] + arm[1], joints[1] + arm[2],
+                              joints[2] + arm[3] - rod[3]])
+    return places
+
+
+def _chain_motion(linkage: Mechanism, state: Array) -> tuple[Array, Array, Array, Array]:
+    """Return positions and velocities (4,) of the mass centres, gaps and gap rates (3,)."""
+    turn, share = np.exp(1j * state[LINK_ANGLES]), linkage.link_masses / linkage.link_masses.sum()
+    parts = []
+    for unit, part, centre in ((turn, JOINT_GAPS, CENTRE_POSITION),
+                               (1j * state[LINK_RATES] * turn, JOINT_GAP_RATES, CENTRE_VELOCITY)):
+        open_1, open_2, open_4 = state[part].view(complex)
+        signed = linkage.link_lengths * unit
+        # Joint 3 is open by what the other joints and the links leave.
+        open_3 = signed[0] + open_4 + signed[3] - open_1 - signed[1] - open_2 - signed[2]
+        gaps = np.array([open_1, open_2, open_3])
+        places = _chain(linkage, unit, gaps)
+        parts.append((places + state[centre].view(complex) - share @ places, gaps))
+    (places, gaps), (speeds, rates) = parts
+    return places, speeds, gaps, rates
+
+
+def _pairs(values: Array) -> list[float]:
+    """Return complex numbers as x and y in turn."""
+    return np.ascontiguousarray(values).view(float).tolist()
+
+
+@pytest.fixture(scope='session')
+def kane_accelerations() -> Callable[[Mechanism, Array, Array], Array]:
+    """Return the angular accelerations (8,) of links and wheels by Kane's method."""
+    pytest.importorskip('sympy')
+    from fourbar_ros.studies.independent import kane
+
+    def solve(linkage: Mechanism, state: Array, torques: Array) -> Array:
+        matrix, forcing = kane.derive_equations((False,) * 4).evaluate(
+            state[LINK_ANGLES], state[LINK_RATES], torques, kane.parameters_of(linkage))
+        change = np.linalg.solve(np.array(matrix), np.array(forcing))
+        links = np.concatenate([change[2:4], change[8:]])
+        return np.concatenate([links, links + change[4:8]])
+
+    return solve
+
+
+@pytest.fixture(scope='session')
+def kane_accelerations_under_loads() -> Callable[..., Array]:
+    """Return the accelerations (4, 3) of the links (x, y, angle) by Kane's method, with loads."""
+    pytest.importorskip('sympy')
+    from fourbar_ros.studies.independent import kane
+
+    def solve(linkage: Mechanism, state: Array, torques: Array, effects: dict[str, Any]) -> Array:
+        # Links feel the opposite of the motor torques; the wheels are left out.
+        loads = {**effects, 'link_torques': effects['link_torques'] - torques}
+        parameters = [*kane.parameters_of(linkage)[:20], *(0.0,) * 4]
+        speeds = _chain_motion(linkage, state)[1]
+        matrix, forcing = kane.derive_equations((True,) * 4, loads=True).evaluate(
+            state[LINK_ANGLES], state[LINK_RATES], np.zeros(4), parameters, _pairs(speeds[:1]),
+            *(np.ravel(loads[name]).tolist() for name in kane.LOADS))
+        change = np.linalg.solve(np.array(matrix), np.array(forcing))
+        angular = change[[2, 3, 4, 5]]
+        turn = np.exp(1j * state[LINK_ANGLES])
+        places = change[:2].view(complex) + _chain(
+            linkage, (1j * angular - state[LINK_RATES]**2) * turn, np.zeros(3))
+        return np.column_stack([places.real, places.imag, angular])
+
+    return solve
+
+
+@pytest.fixture(scope='session')
+def kane_compliant_motion() -> Callable[..., Array]:
+    """
+    Integrate Kane's equations of a linkage with compliant joints by SciPy.
+
+    Returns places and angles (12,), then speeds (12,) of the links after a time.
+    """
+    pytest.importorskip('sympy')
+    from fourbar_ros.studies.independent import kane
+    from scipy.integrate import solve_ivp
+
+    def move(linkage: Mechanism, start: Array, time: float, amplitude: Array, frequency: Array,
+             phase: Array, prescribed: Array | None = None) -> Array:
+        held = np.zeros(4, dtype=bool) if prescribed is None else prescribed
+        equations = kane.derive_equations((True,) * 4, loads=True, compliant=True)
+        # A prescribed wheel adds its inertia to its link; a free wheel leaves its torque.
+        wheels, omega = linkage.flywheel_inertias, 2.0 * np.pi * frequency
+        parameters = np.array([*kane.parameters_of(linkage)[:20], *(0.0,) * 4])
+        parameters[8:12] += np.where(held, wheels, 0.0)
+        drive = np.where(held, -wheels * omega**2, 1.0) * amplitude
+        arguments = (linkage.joint_stiffness.tolist(), linkage.joint_damping.tolist())
+        nothing = {name: [0.0] * count for name, count in kane.LOADS.items()}
+        nothing['smoothing'] = [1.0]
+
+        def slope(t: float, state: Array) -> Array:
+            # Place of A, gaps, angles; then their rates.
+            loads = {**nothing, 'link_torques': (-drive * np.cos(omega * t + phase)).tolist()}
+            row = state.tolist()
+            matrix, forcing = equations.evaluate(
+                row[8:12], row[20:24], NONE, parameters.tolist(), row[12:14], *loads.values(),
+                row[2:8], row[14:20], *arguments)
+            change = np.linalg.solve(np.array(matrix), np.array(forcing))
+            return np.concatenate([state[12:], change[:2], change[6:], change[2:6]])
+
+        places, speeds, gaps, rates = _chain_motion(linkage, start)
+        begin = np.array([*_pairs(places[:1]), *_pairs(gaps), *start[LINK_ANGLES],
+                          *_pairs(speeds[:1]), *_pairs(rates), *start[LINK_RATES]])
+        end = solve_ivp(slope, (0.0, time), begin, method='DOP853', rtol=1e-12,
+                        atol=1e-12).y[:, -1]
+        turn = np.exp(1j * end[8:12])
+        rows = []
+        for part, unit in ((end[:12], turn), (end[12:], 1j * end[20:] * turn)):
+            at = part[:2].view(complex) + _chain(linkage, unit, part[2:8].view(complex))
+            rows.append(np.column_stack([at.real, at.imag, part[8:]]).ravel())
+        return np.concatenate(rows)
+
+    return move

@@ -6,7 +6,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
-from typing import Any
 
 from fourbar_ros.mechanism import assemble, branch_of, Mechanism, reduced_form
 from fourbar_ros.mechanism.compliant import RESOLUTION
@@ -78,79 +77,6 @@ def held(linkage: Mechanism, start: Array, step: float, steps: int, torques: Arr
 
 # --- An independent derivation ----------------------------------------------------------------
 
-@pytest.fixture(scope='module')
-def lagrange() -> Callable[..., Array]:
-    """
-    Derive the motion of the four bodies once more, from their potential energy.
-
-    Lagrange's equations with the springs' potential and the dampers' dissipation function, which
-    SymPy differentiates; SciPy integrates. Nothing is shared but the conventions.
-    """
-    sympy = pytest.importorskip('sympy')
-    from scipy.integrate import solve_ivp
-
-    q, v = sympy.symbols('q:12'), sympy.symbols('v:12')
-    lengths, along, across, springs, dampers = (
-        sympy.symbols(f'{name}:4') for name in ('l', 'x', 'y', 'k', 'c'))
-
-    def place(i: int, forward: Any) -> Any:
-        """Place the point of link i that is `forward` along its x axis; links one by one in q."""
-        cos, sin = sympy.cos(q[3 * i + 2]), sympy.sin(q[3 * i + 2])
-        return sympy.Matrix([q[3 * i] + cos * (forward - along[i]) + sin * across[i],
-                             q[3 * i + 1] + sin * (forward - along[i]) - cos * across[i]])
-
-    gaps = [place(0, 0) - place(1, 0), place(1, lengths[1]) - place(2, 0),
-            place(2, lengths[2]) - place(3, lengths[3]), place(3, 0) - place(0, lengths[0])]
-    # Velocity of one link relative to the other in the middle of the gap.
-    slips = [gap.jacobian(q) * sympy.Matrix(v)
-             - (v[3 * i + 2] + v[3 * k + 2]) / 2 * sympy.Matrix([-gap[1], gap[0]])
-             for gap, (i, k) in zip(gaps, ((0, 1), (1, 2), (2, 3), (3, 0)))]
-    potential = sum(k * gap.dot(gap) / 2 for k, gap in zip(springs, gaps))
-    dissipation = sum(c * slip.dot(slip) / 2 for c, slip in zip(dampers, slips))
-    forces = sympy.lambdify(
-        [q, v, lengths, along, across, springs, dampers],
-        [-potential.diff(at) - dissipation.diff(speed) for at, speed in zip(q, v)],
-        modules='math', cse=True)
-
-    def bodies(linkage: Mechanism, state: Array) -> tuple[Array, Array]:
-        """Hang b and d on a, c on b, each by its gap; then shift the mass centre in place."""
-        turn = np.exp(1j * state[LINK_ANGLES])
-        arm, rod = linkage.com_positions @ [1.0, 1j] * turn, linkage.link_lengths * turn
-        spin, share = 1j * state[LINK_RATES], linkage.link_masses / linkage.link_masses.sum()
-        open_1, open_2, open_4 = state[JOINT_GAPS].view(complex)
-        slip_1, slip_2, slip_4 = state[JOINT_GAP_RATES].view(complex)
-        at = arm + [0.0, open_1, open_1 + rod[1] + open_2, rod[0] + open_4]
-        moving = spin * arm + [
-            0.0, slip_1, slip_1 + spin[1] * rod[1] + slip_2, spin[0] * rod[0] + slip_4]
-        at += state[CENTRE_POSITION].view(complex) - share @ at
-        moving += state[CENTRE_VELOCITY].view(complex) - share @ moving
-        return (np.column_stack([at.real, at.imag, state[LINK_ANGLES]]).ravel(),
-                np.column_stack([moving.real, moving.imag, state[LINK_RATES]]).ravel())
-
-    def move(linkage: Mechanism, start: Array, time: float, amplitude: Array, frequency: Array,
-             phase: Array, prescribed: Array = FREE) -> Array:
-        """Return places and angles (12,), then speeds (12,) of the bodies after a time."""
-        parameters = [list(map(float, values)) for values in (
-            linkage.link_lengths, *linkage.com_positions.T, linkage.joint_stiffness,
-            linkage.joint_damping)]
-        wheels, omega = linkage.flywheel_inertias, 2.0 * np.pi * frequency
-        inertia = np.column_stack([
-            linkage.link_masses, linkage.link_masses,
-            linkage.link_inertias + np.where(prescribed, wheels, 0.0)]).ravel()
-        drive = np.where(prescribed, -wheels * omega**2, 1.0) * amplitude
-
-        def slope(t: float, state: Array) -> Array:
-            force = np.array(forces(state[:12].tolist(), state[12:].tolist(), *parameters))
-            force[2::3] -= drive * np.cos(omega * t + phase)
-            return np.concatenate([state[12:], force / inertia])
-
-        end: Array = solve_ivp(slope, (0.0, time), np.concatenate(bodies(linkage, start)),
-                               method='DOP853', rtol=1e-12, atol=1e-12).y[:, -1]
-        return end
-
-    return move
-
-
 def bodies_of(linkage: Mechanism, state: Array) -> Array:
     """Return a state as the other derivation has it."""
     place, speed = body_motion(linkage, state)
@@ -166,7 +92,7 @@ def driven(rng: np.random.Generator) -> tuple[Array, Array, Array]:
 @pytest.mark.parametrize('seed', SEEDS)
 def test_motion_agrees_with_an_independent_derivation(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
-    lagrange: Callable[..., Array],
+    kane_compliant_motion: Callable[..., Array],
 ) -> None:
     """Driven and prescribed wheels in any mix, joints of unequal stiffness and damping."""
     rng = np.random.default_rng(seed)
@@ -176,7 +102,7 @@ def test_motion_agrees_with_an_independent_derivation(
     constants = linkage.constants_with(prescribed)
     time, step = 0.1, 0.02 / constants.fastest_joint_mode
     end = move_with_cosines(start, np.array([0.0, time]), *drive, step, constants, NOTHING)[-1]
-    expected = lagrange(linkage, start, time, *drive, prescribed)
+    expected = kane_compliant_motion(linkage, start, time, *drive, prescribed)
     # A swing of frequency w is late by w T (w h)^4 / 120 rad after a time T. Joints open by 0.01 m
     # swing links of 0.5 m and more by 0.03 rad at most, at w times that.
     late = constants.fastest_joint_mode * time * 0.02**4 / 120.0
@@ -188,7 +114,7 @@ def test_motion_agrees_with_an_independent_derivation(
 @pytest.mark.parametrize('seed', SEEDS)
 def test_integration_is_of_order_four(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
-    lagrange: Callable[..., Array],
+    kane_compliant_motion: Callable[..., Array],
 ) -> None:
     """Halving the step divides the error by 16."""
     rng = np.random.default_rng(seed)
@@ -197,7 +123,7 @@ def test_integration_is_of_order_four(
     drive = driven(rng)
     longest = 0.4 * RESOLUTION / linkage.constants.fastest_joint_mode
     time = 64 * longest
-    exact = lagrange(linkage, start, time, *drive)
+    exact = kane_compliant_motion(linkage, start, time, *drive)
     errors = [
         np.abs(bodies_of(linkage, move_with_cosines(
             start, np.array([0.0, time]), *drive, longest / parts * (1.0 + 1e-9),

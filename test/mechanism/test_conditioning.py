@@ -77,9 +77,7 @@ def test_condition_is_that_of_kanes_method(seed: int, random_linkage: Draw) -> N
     closed = configurations(linkage, 'open')
     index = list(closed)[len(closed) // 2]
     # Wheels that are held on links without inertia of their own leave the links'.
-    parameters = [float(value) for group in (
-        linkage.link_lengths, linkage.link_masses, linkage.link_inertias,
-        linkage.com_positions[:, 0], linkage.com_positions[:, 1], np.zeros(4)) for value in group]
+    parameters = [*kane.parameters_of(linkage)[:20], *(0.0,) * 4]
     matrix = np.array(kane.derive_equations((True,) * 4).evaluate(
         closed[index], np.zeros(4), np.zeros(4), parameters)[0])
     gamma = -np.linalg.solve(matrix[4:, 4:], matrix[4:, :4])

@@ -376,70 +376,10 @@ def test_stiff_joints_come_near_rigid_ones(
 
 # --- An independent derivation ----------------------------------------------------------------
 
-@pytest.fixture(scope='module')
-def maximal() -> Callable[..., Array]:
-    """
-    Derive the accelerations once more, in maximal coordinates, from energies alone.
-
-    Coordinates: mass centre and angle of each link. Friction and drag come from a dissipation
-    function, the slope of the table from a potential, and the eight conditions of the joints
-    bring multipliers; SymPy differentiates. Nothing is shared but the conventions.
-    """
-    sympy = pytest.importorskip('sympy')
-    q, v = sympy.symbols('q:12'), sympy.symbols('v:12')
-    lengths, masses, along, across, coulomb, viscous, drag, spin_drag = (
-        sympy.symbols(f'{name}:4') for name in ('l', 'm', 'x', 'y', 'T', 'c', 'd', 's'))
-    slope, smoothing = sympy.symbols('g:2'), sympy.symbols('smoothing')
-
-    def place(i: int, forward: Any) -> Any:
-        """Place the point of link i that is `forward` along its x axis; links one by one in q."""
-        cos, sin = sympy.cos(q[3 * i + 2]), sympy.sin(q[3 * i + 2])
-        return sympy.Matrix([q[3 * i] + cos * (forward - along[i]) + sin * across[i],
-                             q[3 * i + 1] + sin * (forward - along[i]) - cos * across[i]])
-
-    gaps = sympy.Matrix([
-        place(0, 0) - place(1, 0), place(1, lengths[1]) - place(2, 0),
-        place(2, lengths[2]) - place(3, lengths[3]), place(3, 0) - place(0, lengths[0])])
-    jacobian = gaps.jacobian(q)
-    opening = jacobian * sympy.Matrix(v)
-    potential = -sum(
-        masses[i] * (slope[0] * q[3 * i] + slope[1] * q[3 * i + 1]) for i in range(4))
-    joints = [v[3 * i + 2] - v[3 * k + 2] for i, k in JOINTS]
-    dissipation = sum(
-        coulomb[i] * sympy.sqrt(joints[i]**2 + smoothing**2) + viscous[i] * joints[i]**2 / 2
-        + drag[i] * (v[3 * i]**2 + v[3 * i + 1]**2) / 2 + spin_drag[i] * v[3 * i + 2]**2 / 2
-        for i in range(4))
-    terms = sympy.lambdify(
-        [q, v, lengths, masses, along, across, coulomb, viscous, drag, spin_drag, slope,
-         smoothing],
-        [[-potential.diff(at) - dissipation.diff(speed) for at, speed in zip(q, v)],
-         jacobian, opening.jacobian(q) * sympy.Matrix(v)], cse=True)
-
-    def solve(linkage: Mechanism, state: Array, torques: Array, effects: dict[str, Any]) -> Array:
-        """Return the accelerations of the bodies (4, 3): x, y, angle."""
-        place_of, speed = body_motion(linkage, state)
-        force, jac, centripetal = terms(
-            np.column_stack([place_of, state[LINK_ANGLES]]).ravel(),
-            np.column_stack([speed, state[LINK_RATES]]).ravel(),
-            linkage.link_lengths, linkage.link_masses, *linkage.com_positions.T,
-            *(effects[name] for name in (
-                'joint_coulomb', 'joint_viscous', 'link_drag', 'link_spin_drag', 'gravity',
-                'smoothing')))
-        force = np.array(force)
-        force[2::3] += effects['link_torques'] - torques
-        inertia = np.diag(np.column_stack(
-            [linkage.link_masses, linkage.link_masses, linkage.link_inertias]).ravel())
-        whole = np.block([[inertia, jac.T], [jac, np.zeros((8, 8))]])
-        right = np.concatenate([force, -np.ravel(centripetal)])
-        return np.linalg.solve(whole, right)[:12].reshape(4, 3)
-
-    return solve
-
-
 @pytest.mark.parametrize('seed', range(40))
 def test_accelerations_agree_with_an_independent_model(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
-    maximal: Callable[..., Array],
+    kane_accelerations_under_loads: Callable[..., Array],
 ) -> None:
     """Under all effects at once, the links' and that of the mass centre."""
     rng = np.random.default_rng(seed)
@@ -448,8 +388,8 @@ def test_accelerations_agree_with_an_independent_model(
     torques, effects = rng.uniform(-1.0, 1.0, 4), everything(rng)
     ours = np.empty_like(state)
     evaluate(state, torques, linkage.constants, surroundings(**effects), ours)
-    expected = maximal(linkage, state, torques, effects)
-    # Rounding times the condition number of 20 equations in units of order one.
+    expected = kane_accelerations_under_loads(linkage, state, torques, effects)
+    # Rounding times the condition number of the equations in units of order one.
     size = np.abs(expected).max()
     np.testing.assert_allclose(ours[LINK_RATES], expected[:, 2], rtol=0.0, atol=1e-11 * size)
     np.testing.assert_allclose(

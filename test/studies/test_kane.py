@@ -3,6 +3,8 @@
 
 """The derivation by Kane's method: reference motions, conservation, prescribed wheels."""
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 import json
 from pathlib import Path
@@ -10,15 +12,14 @@ from typing import Any
 
 from fourbar_ros.mechanism import assemble, Mechanism, reduced_form
 from fourbar_ros.mechanism.case import Case, load_case
+from fourbar_ros.studies.independent import kane
 import numpy as np
 from numpy.typing import NDArray
 import pytest
 
-pytest.importorskip('sympy')
-
-from fourbar_ros.studies.independent import kane  # noqa: E402
-
 Array = NDArray[np.float64]
+Refuses = Callable[..., AbstractContextManager[None]]
+Conserved = Callable[[Case], tuple[Array, Array]]
 
 REFERENCE = Path(__file__).parents[2] / 'config' / 'reference'
 ZERO = np.zeros(4)
@@ -26,41 +27,23 @@ FREE = np.zeros(4, dtype=bool)
 PRESCRIBED = np.ones(4, dtype=bool)
 
 
-def bodies(mechanism: Mechanism, angles: Array, rates: Array) -> tuple[Array, Array]:
-    """Return mass centres (4, 2) and their velocities, joint 1 at rest in the origin."""
-    def arm(link: int, x: float, y: float) -> tuple[Array, Array]:
-        c, s = np.cos(angles[link]), np.sin(angles[link])
-        at = np.array([c * x - s * y, s * x + c * y])
-        return at, rates[link] * np.array([-at[1], at[0]])
-
-    base = {2: arm(1, mechanism.link_lengths[1], 0.0), 3: arm(0, mechanism.link_lengths[0], 0.0)}
-    own = [arm(link, *mechanism.com_positions[link]) for link in range(4)]
-    nowhere = (np.zeros(2), np.zeros(2))
-    return (np.array([own[i][0] + base.get(i, nowhere)[0] for i in range(4)]),
-            np.array([own[i][1] + base.get(i, nowhere)[1] for i in range(4)]))
+@pytest.fixture(autouse=True)
+def sympy() -> None:
+    """Skip the test where SymPy is not installed."""
+    pytest.importorskip('sympy')
 
 
-def momentum_and_energy(mechanism: Mechanism, angles: Array, rates: Array, wheels: Array
-                        ) -> tuple[float, float]:
-    """Sum up body by body, about the mass centre of the whole."""
-    mass = mechanism.link_masses
-    at, velocity = bodies(mechanism, angles, rates)
-    at = at - mass @ at / mass.sum()
-    velocity = velocity - mass @ velocity / mass.sum()
-    momentum = (mechanism.link_inertias @ rates + mechanism.flywheel_inertias @ wheels
-                + mass @ (at[:, 0] * velocity[:, 1] - at[:, 1] * velocity[:, 0]))
-    energy = (mechanism.link_inertias @ rates**2 + mechanism.flywheel_inertias @ wheels**2
-              + mass @ (velocity**2).sum(axis=1)) / 2.0
-    return float(momentum), float(energy)
+@pytest.fixture(scope='module')
+def conserved(momentum_and_energy: Callable[..., tuple[float, float]]
+              ) -> Callable[[Case], tuple[Array, Array]]:
+    """Return a function that gives momentum and energy (n,) along the motion of a case."""
+    def along(case: Case) -> tuple[Array, Array]:
+        motion = kane.simulate(case)
+        momentum, energy = np.array([momentum_and_energy(case.mechanism, *state) for state in zip(
+            motion.link_angles, motion.link_rates, motion.flywheel_speeds_absolute)]).T
+        return momentum, energy
 
-
-def conserved(case: Case) -> tuple[Array, Array]:
-    """Return momentum and energy (n,) along the motion of a case."""
-    motion = kane.simulate(case)
-    along = [momentum_and_energy(case.mechanism, *state) for state in zip(
-        motion.link_angles, motion.link_rates, motion.flywheel_speeds_absolute)]
-    momentum, energy = np.array(along).T
-    return momentum, energy
+    return along
 
 
 @pytest.fixture(scope='module')
@@ -91,7 +74,9 @@ def test_reference_motions(name: str) -> None:
         np.testing.assert_allclose(values, reference[expected], rtol=1e-10, atol=1e-10)
 
 
-def test_wheels_without_torque_leave_momentum_and_energy(moving: Case) -> None:
+def test_wheels_without_torque_conserve_momentum_and_energy(
+    moving: Case, conserved: Conserved,
+) -> None:
     momentum, energy = conserved(moving)
     np.testing.assert_allclose(momentum, momentum[0], rtol=1e-11)
     np.testing.assert_allclose(energy, energy[0], rtol=1e-11)
@@ -100,14 +85,18 @@ def test_wheels_without_torque_leave_momentum_and_energy(moving: Case) -> None:
         speeds, np.broadcast_to(speeds[0], speeds.shape), rtol=0.0, atol=1e-10)
 
 
-def test_wheels_locked_to_their_links_leave_momentum_and_energy(moving: Case) -> None:
+def test_wheels_locked_to_their_links_conserve_momentum_and_energy(
+    moving: Case, conserved: Conserved,
+) -> None:
     locked = replace(moving, prescribed=PRESCRIBED, flywheel_speeds_absolute=moving.link_rates)
     momentum, energy = conserved(locked)
     np.testing.assert_allclose(momentum, momentum[0], rtol=1e-11)
     np.testing.assert_allclose(energy, energy[0], rtol=1e-11)
 
 
-def test_mixed_wheels_keep_momentum_and_follow_their_laws(moving: Case) -> None:
+def test_mixed_wheels_conserve_momentum_and_follow_their_laws(
+    moving: Case, conserved: Conserved,
+) -> None:
     """Wheels a and d by angle, b and c by torque: motors are inside, momentum does not care."""
     prescribed = np.array([True, False, False, True])
     mixed = replace(moving, amplitude=np.array([9.0, 3e-5, -2e-5, 6.0]), prescribed=prescribed)
@@ -164,14 +153,13 @@ def test_torque_that_holds_a_wheel_to_its_law_does_the_same(paper: Mechanism) ->
     assert np.ptp(by_angle.link_angles[:, 0]) > 0.5
 
 
-def test_start_on_a_change_point_is_refused_in_one_line(paper: Mechanism) -> None:
+def test_start_on_a_change_point_is_refused(paper: Mechanism, refuses: Refuses) -> None:
     case = Case(
         mechanism=paper, link_angles=ZERO, link_rates=np.array([0.5, -0.5, 0.5, -0.5]),
         flywheel_speeds_absolute=ZERO, amplitude=ZERO, frequency_hz=ZERO, phase=ZERO,
         times=np.linspace(0.0, 0.6, 7), prescribed=FREE)
-    with pytest.raises(kane.KaneError, match='links c and d lie on a line') as caught:
+    with refuses(kane.KaneError, time=0.0):
         kane.simulate(case)
-    assert '\n' not in str(caught.value)
 
 
 def test_motion_into_a_line_of_links_ends(uneven: Mechanism) -> None:
@@ -184,5 +172,7 @@ def test_motion_into_a_line_of_links_ends(uneven: Mechanism) -> None:
         mechanism=kite, link_angles=angles, link_rates=np.concatenate([rates, dependent]),
         flywheel_speeds_absolute=ZERO, amplitude=ZERO, frequency_hz=ZERO, phase=ZERO,
         times=np.linspace(0.0, 0.2, 5), prescribed=FREE)
-    with pytest.raises(kane.KaneError, match='lie on a line'):
+    with pytest.raises(kane.KaneError) as caught:
         kane.simulate(case)
+    # The links are collinear after 0.05 s.
+    assert 0.0 < caught.value.values['time'] < 0.1
