@@ -167,8 +167,8 @@ def derive_equations(prescribed: tuple[bool, ...], loads: bool = False, complian
     x, y, v_x, v_y = mechanics.dynamicsymbols('x y v_x v_y')
     phi, psi = (mechanics.dynamicsymbols(f'{name}_a:d') for name in ('phi', 'psi'))
     omega, spin = (mechanics.dynamicsymbols(f'{name}_a:d') for name in ('omega', 'Omega'))
-    gaps, gap_rates = ((mechanics.dynamicsymbols(f'{name}:6') for name in ('gap', 'gap_rate'))
-                       if compliant else ((0,) * 6, (0,) * 6))
+    gaps, gap_rates = (mechanics.dynamicsymbols(f'{name}:6') if compliant else ()
+                       for name in ('gap', 'gap_rate'))
     length, mass, inertia, com_x, com_y, wheel_inertia = parameters = [
         sympy.symbols(f'{name}_a:d') for name in ('l', 'm', 'I', 'c_x', 'c_y', 'I_f')]
     command = sympy.symbols('command_a:d')
@@ -266,9 +266,8 @@ def derive_equations(prescribed: tuple[bool, ...], loads: bool = False, complian
             applied += [(middles[0], force), (middles[1], -force)]
 
     free_psi, free_spin = [psi[i] for i in free], [spin[i] for i in free]
-    rates = zip((x, y, *phi, *free_psi, *(gaps if compliant else ())),
-                (v_x, v_y, *omega, *free_spin, *(gap_rates if compliant else ())))
-    kinematic = [coordinate.diff(time) - speed for coordinate, speed in rates]
+    kinematic = [coordinate.diff(time) - speed for coordinate, speed in zip(
+        (x, y, *phi, *free_psi, *gaps), (v_x, v_y, *omega, *free_spin, *gap_rates))]
     if compliant:
         method = mechanics.KanesMethod(
             table, q_ind=[x, y, phi[0], phi[1], *free_psi, *phi[2:], *gaps],
