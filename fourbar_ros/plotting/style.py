@@ -11,9 +11,10 @@ one file reads well on both.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
 import io
 import re
-from typing import Any
+from typing import Any, ParamSpec
 
 from fourbar_ros.analysis.bags import Floats
 from matplotlib import rc_context
@@ -43,6 +44,8 @@ LINK_COLOURS = tuple(COLOURS[f'link_{letter}'] for letter in 'abcd')
 LINK_DASHES = ('-', '-', (0, (4, 3)), (0, (4, 3)))
 
 WIDTH_IN = 10.0
+# Resolution of PNG files [dots per inch].
+DPI = 120
 # Two points a bin: about one bin for each pixel of a panel.
 BINS = 450
 
@@ -108,6 +111,33 @@ def _for_page(svg: str, salt: str) -> str:
     for name, colour in COLOURS.items():
         svg = svg.replace(colour, f'var(--{name.replace("_", "-")})')
     return svg
+
+
+Arguments = ParamSpec('Arguments')
+
+
+def as_png(make: Callable[Arguments, Figure]) -> Callable[Arguments, bytes]:
+    """Decorate a function that makes a figure: it draws in this style and returns a PNG file."""
+    @wraps(make)
+    def draw_png(*args: Arguments.args, **kwargs: Arguments.kwargs) -> bytes:
+        with rc_context(RC):
+            buffer = io.BytesIO()
+            make(*args, **kwargs).savefig(
+                buffer, format='png', dpi=DPI, facecolor=COLOURS['paper'])
+            return buffer.getvalue()
+    return draw_png
+
+
+def panels(height: float, rows: int, columns: int, **options: Any) -> tuple[Figure, Any]:
+    """
+    Make a figure of the full width with a grid of axes.
+
+    :param height: [inch].
+    :param options: for `Figure.subplots`.
+    :returns: the figure and its axes, as `Figure.subplots` returns them.
+    """
+    figure = Figure(figsize=(WIDTH_IN, height), layout='constrained')
+    return figure, figure.subplots(rows, columns, **options)
 
 
 def decimate(x: Floats, y: Floats, bins: int = BINS) -> tuple[Floats, Floats]:
