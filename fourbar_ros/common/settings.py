@@ -109,6 +109,8 @@ class Setting:
             value = int(value)
         if kind is float and type(value) is int:
             value = _as_float(value)
+        elif kind is float and isinstance(value, float):
+            value = float(value)    # numpy's scalar is a subclass
         quoted = _quoted(value)
         if type(value) is not kind:
             raise SettingError(f'{name} must be {_KINDS[kind]}, got {quoted}',

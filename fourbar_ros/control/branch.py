@@ -17,19 +17,14 @@ from math import pi, sin
 
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.angles import wrap
+from fourbar_ros.mechanism.change_points import (
+    BRANCH_TOLERANCE,
+    EQUAL_LENGTHS,
+    IN_LINE_ANGLE,
+)
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-# Lengths that differ by less than this, relative to their mean, are equal.
-EQUAL_LENGTHS = 1e-9
-
-# Links of a pair as close to their angle as this are taken to be on the branch [rad]: six times
-# what a sensor of 0.1 deg is off. Another branch comes as close only where it meets it.
-ON_BRANCH = 0.01
-
-# Pairs as close to in line as this are at a change point [rad].
-IN_LINE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -96,9 +91,9 @@ class Branch:
         return self.spread(angles[self.axes] + 0.5 * (ahead - offsets), offsets)
 
     def contains(self, mechanism: Mechanism, angles: Array) -> bool:
-        """Tell whether the linkage has this branch and is on it, within `ON_BRANCH` (4,)."""
+        """Test whether the linkage is on this branch, within `BRANCH_TOLERANCE` (4,)."""
         ahead = (angles[self.followers] - angles[self.axes]).tolist()
-        return (all(abs(wrap(angle - self.apart)) < ON_BRANCH for angle in ahead)
+        return (all(abs(wrap(angle - self.apart)) < BRANCH_TOLERANCE for angle in ahead)
                 and (opposite_links_equal(mechanism) if self == PARALLELOGRAM
                      else is_rhombus(mechanism)))
 
@@ -135,7 +130,7 @@ def on_parallelogram(mechanism: Mechanism, link_angles: ArrayLike) -> bool:
     branches cannot be told apart, and the parallelogram is assumed.
 
     :param link_angles: (4,) any turns [rad].
-    :returns: True where opposite links are equally long and parallel within `ON_BRANCH`.
+    :returns: True where opposite links are equally long and parallel within `BRANCH_TOLERANCE`.
     """
     return PARALLELOGRAM.contains(mechanism, np.asarray(link_angles, dtype=float))
 
@@ -157,9 +152,9 @@ def branch_at(mechanism: Mechanism, link_angles: ArrayLike, *, choosing: bool = 
 
 
 def at_change_point(branch: Branch, angles: Array) -> bool:
-    """Tell whether all links of a linkage on a branch are in line, within `IN_LINE` (4,)."""
+    """Tell whether all links of a linkage on a branch are in line, within `IN_LINE_ANGLE` (4,)."""
     first, second = branch.axes
-    return abs(sin(angles[second] - angles[first])) < IN_LINE
+    return abs(sin(angles[second] - angles[first])) < IN_LINE_ANGLE
 
 
 def met_at(mechanism: Mechanism, branch: Branch, angles: Array) -> Branch | None:

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fourbar_ros.control.branch import at_change_point, Branch, IN_LINE, is_rhombus, met_at
+from fourbar_ros.control.branch import at_change_point, Branch, is_rhombus, met_at
 from fourbar_ros.control.reference_generator import ReferenceGenerator
 from fourbar_ros.control.setpoint import ContradictionError, plan
 from fourbar_ros.control.soft_step import SoftStep
 from fourbar_ros.mechanism import Mechanism
+from fourbar_ros.mechanism.change_points import IN_LINE_ANGLE
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
@@ -83,7 +84,9 @@ def _on_the_other(mechanism: Mechanism, goals: dict[int, float], guide: Referenc
     except ContradictionError:
         return None
     opened = np.diff(step.goal - start[0])
-    return BranchSelection(step, present, goal, other) if abs(float(opened[0])) > IN_LINE else None
+    if abs(float(opened[0])) <= IN_LINE_ANGLE:
+        return None
+    return BranchSelection(step, present, goal, other)
 
 
 def _why_no_other(mechanism: Mechanism, guide: ReferenceGenerator) -> str:
@@ -96,5 +99,5 @@ def _why_no_other(mechanism: Mechanism, guide: ReferenceGenerator) -> str:
                 f'{lengths.min():.6g} to {lengths.max():.6g} m')
     if not guide.resting or not at_change_point(guide.branch, guide.angles):
         return ('; another branch can be chosen only where the reference rests at a change point, '
-                f'within {IN_LINE:g} rad')
+                f'within {IN_LINE_ANGLE:g} rad')
     return ''

@@ -15,17 +15,13 @@ from __future__ import annotations
 from math import cos, sin
 
 from fourbar_ros.kernels.compiler import kernel
+from fourbar_ros.kernels.linear_algebra import Vector4
+from fourbar_ros.mechanism.change_points import HOLD_FADES_FROM, HOLD_FADES_TO
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.constrained import directions, factored_inertia
 from fourbar_ros.mechanism.dynamics import mass_matrix, reduced_terms_at
-from fourbar_ros.mechanism.forces import Four
 import numpy as np
 from numpy.typing import NDArray
-
-# The hold on the branch is full up to this |sin theta|, theta between the pairs, and beyond the
-# second there is none: the closure holds it.
-FULL_HOLD = 0.15
-NO_HOLD = 0.35
 
 # Numbers that the kernels hand over in `terms`.
 (A00, A01, A11, BRANCH_A, BRANCH_B, BRANCH_INERTIA, BRANCH_ANGLE, BRANCH_RATE, HOLD,
@@ -34,8 +30,8 @@ TERMS = 10
 
 
 @kernel
-def pair_terms(angles: Array, rates: Four, twins: NDArray[np.int64], constants: Constants
-               ) -> tuple[Array, Four, float, float, float, float, float]:
+def pair_terms(angles: Array, rates: Vector4, twins: NDArray[np.int64], constants: Constants
+               ) -> tuple[Array, Vector4, float, float, float, float, float]:
     """
     Evaluate paper eq. 6 on the pairs, on the parallelogram a with c and b with d.
 
@@ -59,7 +55,7 @@ def pair_terms(angles: Array, rates: Four, twins: NDArray[np.int64], constants: 
 @kernel
 def hold_on_branch(theta: float) -> float:
     """Return how much of the hold on the branch there is, from 0 to 1, without a corner."""
-    x = (NO_HOLD - abs(sin(theta))) / (NO_HOLD - FULL_HOLD)
+    x = (HOLD_FADES_TO - abs(sin(theta))) / (HOLD_FADES_TO - HOLD_FADES_FROM)
     x = min(max(x, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)
 

@@ -29,6 +29,7 @@ from fourbar_ros.control.trajectory import Point, read_trajectory
 from fourbar_ros.control.wheel_command import WheelCommand, WheelCommander
 from fourbar_ros.control.wheel_fault_detection import SHORTED, WheelFaultDetector
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, Mechanism
+from fourbar_ros.mechanism.change_points import TORQUE_CUTOFF
 from fourbar_ros.mechanism.closure import branch_of
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
@@ -41,10 +42,6 @@ rates; hold where the links are; follow a move.
 
 # A setpoint with a stamp (not zero, which means now) may be this far from the last tick [s].
 SETPOINT_TIMEOUT = 1.0
-
-# Closer to a change point than this |sin(phi_d - phi_c)| the wheels get no torque, where opposite
-# links are not parallel.
-NO_HOLD = 0.05
 
 # How soon joints count as sticking when the reference rests, and as sliding when it moves [s].
 TO_STICK, TO_SLIDE = 0.3, 0.05
@@ -420,7 +417,7 @@ class Controller:
 
     def _out_of_hold(self, angles: Array) -> bool:
         """Tell whether the reduced form does not exist here: the wheels coast through it."""
-        return not self._guide.paired and abs(sin(angles[3] - angles[2])) < NO_HOLD
+        return not self._guide.paired and abs(sin(angles[3] - angles[2])) < TORQUE_CUTOFF
 
     def _wheels_after(self, duration: float) -> Wheels:
         """Return the wheels as they are, and what their drift takes in a time [s]."""

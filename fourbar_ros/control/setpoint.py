@@ -20,13 +20,10 @@ from fourbar_ros.control.branch import (
 from fourbar_ros.control.soft_step import SoftStep, TrajectorySegment
 from fourbar_ros.mechanism import ClosureError, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.angles import wrap
+from fourbar_ros.mechanism.change_points import PLANNING_MARGIN
 from fourbar_ros.mechanism.closure import assemble_along, assemblies
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
-
-# Closest approach to a change point that a move may plan, as |sin(phi_d - phi_c)|: there the
-# wheels' hold on the configuration is lost.
-CHANGE_POINT_MARGIN = 0.1
 
 # Instants of a planned move at which it is checked, at least.
 CHECKS = 200
@@ -283,7 +280,7 @@ def _check_distance(mechanism: Mechanism, angles: Array, crossing: bool,
     c, d = (2, 3) if branch is None else branch.followers
     folds = np.abs(np.sin(angles[:, d] - angles[:, c]))
     # Keeping the distance, or moving away, is always allowed, whatever rounding says.
-    limits = np.minimum(np.maximum.accumulate(folds), CHANGE_POINT_MARGIN) - ROUNDING
+    limits = np.minimum(np.maximum.accumulate(folds), PLANNING_MARGIN) - ROUNDING
     if (folds < limits).any():
         reason = ''
         if crossing:
@@ -292,7 +289,7 @@ def _check_distance(mechanism: Mechanism, angles: Array, crossing: bool,
                       ', and only opposite links of equal length lead through it')
         raise SetpointError(
             f'on the way there {LINK_NAMES[c]} and {LINK_NAMES[d]} fold onto a line '
-            f'(|sin| = {float(folds[folds < limits].min()):.3f}, limit {CHANGE_POINT_MARGIN:g}), '
+            f'(|sin| = {float(folds[folds < limits].min()):.3f}, limit {PLANNING_MARGIN:g}), '
             f'a change point{reason}')
 
 

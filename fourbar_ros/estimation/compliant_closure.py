@@ -18,20 +18,18 @@ from math import cos, sin, sqrt
 
 from fourbar_ros.estimation.filter_state import LOOSE_BIASES
 from fourbar_ros.kernels.compiler import kernel
+from fourbar_ros.kernels.linear_algebra import combine, dot, multiply, solve_upper, Vector4
+from fourbar_ros.mechanism.change_points import RIGID_CONSTRAINT_RATIO
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.constrained import (
-    combine,
     constrained_accelerations,
     directions,
-    dot,
     factored_inertia,
-    multiply,
     orthogonal_columns,
     project_onto_closure,
     signed_links,
-    solve_upper,
 )
-from fourbar_ros.mechanism.forces import Four, NOTHING
+from fourbar_ros.mechanism.forces import NOTHING
 import numpy as np
 
 # What the filter is told of a loop that may fail to close: density of the walk of lengths
@@ -40,10 +38,6 @@ import numpy as np
 # to it, density of white torques that turn opposite links apart [N m/sqrt(Hz)], and which share of
 # a disturbance torque acts on the opposite link.
 WALK, STIFFNESS, DAMPING, LIGHTER, KNOWN_TO, APART, SHARED = range(7)
-
-# Ratio of the singular values of the constraints from which on both are rigid: a parallelogram
-# near alignment stays below it, but on the folded branch the links have leverage.
-RIGID_FROM = 0.4
 
 # Stiffer joints than those that make the weak direction so fast there [rad/s] count as just so
 # stiff. A step turns the motion by at most one radian.
@@ -84,8 +78,8 @@ def turned_by_lengths(angles: Array, lengths: Array) -> Array:
 
 
 @kernel
-def _weak_closure(cosines: Four, sines: Four, constants: Constants, slack: Array
-                  ) -> tuple[float, Four, Four, Four, float, float]:
+def _weak_closure(cosines: Vector4, sines: Vector4, constants: Constants, slack: Array
+                  ) -> tuple[float, Vector4, Vector4, Vector4, float, float]:
     """
     Evaluate the closure along its weak direction.
 
@@ -97,7 +91,7 @@ def _weak_closure(cosines: Four, sines: Four, constants: Constants, slack: Array
     factor, _ = factored_inertia(cosines, sines, zero, constants)
     px, py = signed_links(cosines, sines, constants.lengths)
     strong, weak, c, s = orthogonal_columns(factor, px, py)
-    stiffest = (FASTEST / RIGID_FROM) ** 2 / dot(strong, strong)
+    stiffest = (FASTEST / RIGID_CONSTRAINT_RATIO) ** 2 / dot(strong, strong)
     along, across = combine(-s, px, c, py), combine(c, px, s, py)
     rest = max(1.0 - slack[LIGHTER] * dot(weak, weak), LEAST_REST)
     return (along[0] + along[1] + along[2] + along[3], across, combine(-1.0, along, 0.0, along),
@@ -105,8 +99,8 @@ def _weak_closure(cosines: Four, sines: Four, constants: Constants, slack: Array
 
 
 @kernel
-def _accelerations(angles: Four, rates: Four, torques: Array, constants: Constants, slack: Array,
-                   drive: Array) -> Four:
+def _accelerations(angles: Vector4, rates: Vector4, torques: Array, constants: Constants,
+                   slack: Array, drive: Array) -> Vector4:
     """
     Solve the equations of motion, the joints pulling along the weak direction.
 

@@ -41,10 +41,10 @@ from fourbar_ros.estimation.sensor_health import SensorHealth
 from fourbar_ros.estimation.settings import EstimatorSettings
 from fourbar_ros.mechanism import ClosureError, Mechanism, SENSOR_NAMES
 from fourbar_ros.mechanism.angles import wrap_angles
+from fourbar_ros.mechanism.change_points import ASSEMBLY_DISTANCE, REDUCED_FORM_LIMIT
 from fourbar_ros.mechanism.closure import assemblies
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.constrained import project_onto_closure
-from fourbar_ros.mechanism.reduced import NEAR_ALIGNMENT
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -84,10 +84,8 @@ LONGEST_COMMAND_NS = 100_000_000
 BY_SPEED, BY_EFFORT, BY_COMMAND, BY_NOTHING = (
     'wheel speeds', 'wheel efforts', 'commanded efforts', 'nothing')
 
-# Link angles that should be near alignment are brought onto the closure by so many Newton steps,
-# which end no farther from them than this [rad].
+# Newton steps that bring measured link angles near alignment onto the closure.
 NEWTON_STEPS = 5
-NEARBY = 0.1
 
 
 @dataclass(eq=False)
@@ -592,14 +590,14 @@ class Estimator:
         :param measured: (4,), one of them NaN where it is not known [rad].
         :raises ClosureError: there are none.
         """
-        if abs(sin(measured[3] - measured[2])) < NEAR_ALIGNMENT:
+        if abs(sin(measured[3] - measured[2])) < REDUCED_FORM_LIMIT:
             # Two angles do not tell the others here, but four tell what they are.
             near, rates = tuple(measured.tolist()), (0.0, 0.0, 0.0, 0.0)
             constants = self._mechanism.with_rigid_joints().constants
             exact = self._settings.closure_tolerance == 0.0
             for _ in range(NEWTON_STEPS):
                 near, _ = project_onto_closure(near, rates, constants, exact)
-            if np.abs(near - measured).max() < NEARBY:
+            if np.abs(near - measured).max() < ASSEMBLY_DISTANCE:
                 return np.array(near)
         known = [link for link in range(4) if isfinite(measured[link])]
         found: list[Array] = []
@@ -611,7 +609,7 @@ class Estimator:
                                     (measured[first], measured[second]), np.nan_to_num(measured))
             except ClosureError as error:
                 failure = failure or error
-        best, farthest = None, max(NEARBY, 10.0 * self._settings.angle_noise)
+        best, farthest = None, max(ASSEMBLY_DISTANCE, 10.0 * self._settings.angle_noise)
         for angles in found:
             off = float(np.abs(wrap_angles(angles - measured)[known]).max())
             if off < farthest:

@@ -5,7 +5,7 @@
 Kernels of the prediction: where the linkage goes, and what becomes of what is known.
 
 Away from change points links c and d follow a and b, and the transition has columns for these
-alone. Near them (mechanism.reduced, NEAR_ALIGNMENT) all four links are states in their own right,
+alone. Near them (below `REDUCED_FORM_LIMIT`) all four links are states in their own right,
 the transition is that of free links, and the closure and its rate come as measurements without
 noise. Where the links cannot be told from a line, by what is known of them, the constraint that is
 lost there holds nothing.
@@ -24,7 +24,6 @@ from fourbar_ros.estimation.compliant_closure import (
     FASTEST,
     lighten,
     move_elastic,
-    RIGID_FROM,
     SHARED,
     take_lengths,
     turned_by_lengths,
@@ -32,33 +31,31 @@ from fourbar_ros.estimation.compliant_closure import (
 )
 from fourbar_ros.estimation.filter_state import LOOSE_BIASES
 from fourbar_ros.kernels.compiler import kernel
+from fourbar_ros.kernels.linear_algebra import combine, dot, solve_lower, solve_upper
+from fourbar_ros.mechanism.change_points import (
+    DISTINCT_SIGMAS_SQUARED,
+    REDUCED_FORM_LIMIT,
+    RIGID_CONSTRAINT_RATIO,
+)
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.constrained import (
     advance_constrained,
-    combine,
     directions,
-    dot,
     factored_inertia,
     orthogonal_columns,
     project_onto_closure,
     signed_links,
-    solve_lower,
-    solve_upper,
 )
 from fourbar_ros.mechanism.dynamics import gamma_matrix, mass_matrix
 from fourbar_ros.mechanism.forces import NOTHING
 from fourbar_ros.mechanism.integration import advance_state
-from fourbar_ros.mechanism.reduced import close_reduced, NEAR_ALIGNMENT
+from fourbar_ros.mechanism.reduced import close_reduced
 import numpy as np
 from numpy.typing import NDArray
 
 # Half width of the central differences for the transition matrix [rad], [rad/s], and width of the
 # one-sided one, in which the motion is linear but for the length of a step [N m].
 DIFFERENCE = 1e-6
-
-# The weak direction is held by the closure if the singular value that it has is so many times
-# larger than its standard deviation, squared.
-HELD_FROM = 9.0
 
 # To what the closure is known, in links' lengths [rad] and [rad/s]: the covariance must not become
 # singular by more than rounding allows.
@@ -75,7 +72,7 @@ GIVES_AT = 1e-3
 @kernel
 def near_change_point(x: Array) -> bool:
     """Tell whether links c and d are so close to one line that all four are states."""
-    return not abs(sin(x[3] - x[2])) > NEAR_ALIGNMENT
+    return not abs(sin(x[3] - x[2])) > REDUCED_FORM_LIMIT
 
 
 @kernel
@@ -176,7 +173,7 @@ def weak_is_held(x: Array, covariance: Array, loose: bool, constants: Constants)
     strong, weak, c, s = orthogonal_columns(factor, px, py)
     size = dot(strong, strong)
     if loose:
-        return dot(weak, weak) > RIGID_FROM * RIGID_FROM * size
+        return dot(weak, weak) > RIGID_CONSTRAINT_RATIO * RIGID_CONSTRAINT_RATIO * size
     # How the weak column changes with the angles relative to link a, the strong one taken out.
     changes = np.zeros((4, 4))
     for i in range(1, 4):
@@ -192,7 +189,7 @@ def weak_is_held(x: Array, covariance: Array, loose: bool, constants: Constants)
             relative = covariance[i, k] - covariance[i, 0] - covariance[0, k] + covariance[0, 0]
             for j in range(4):
                 spread += changes[i, j] * relative * changes[k, j]
-    return dot(weak, weak) > HELD_FROM * spread
+    return dot(weak, weak) > DISTINCT_SIGMAS_SQUARED * spread
 
 
 @kernel

@@ -17,6 +17,7 @@ from operator import itemgetter
 
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.mechanism.angles import wrap
+from fourbar_ros.mechanism.change_points import FOLDED_SINE
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.mechanism import LINK_NAMES, Mechanism
 import numpy as np
@@ -27,9 +28,6 @@ BRANCHES = ('open', 'crossed')
 # Each link's sign in the closure written as a sum that vanishes.
 SIGNS = (-1.0, 1.0, 1.0, -1.0)
 
-
-# Sine of the angle within which two links count as lying on each other.
-FOLDED = 1e-6
 
 # How far a given state may be off the closure, relative to the longest link (and per second):
 # generous to rounded digits, far below any real mistake.
@@ -63,8 +61,8 @@ def branch_of(link_angles: ArrayLike) -> str:
     :returns: `open`, `crossed` or `folded`; exactly on a change point, where they meet, `open`.
     """
     a, b, c, d = np.asarray(link_angles, dtype=float)
-    if abs(sin(b - a)) < FOLDED and abs(sin(d - c)) < FOLDED:
-        return 'folded' if abs(sin(c - a)) > FOLDED else 'open'
+    if abs(sin(b - a)) < FOLDED_SINE and abs(sin(d - c)) < FOLDED_SINE:
+        return 'folded' if abs(sin(c - a)) > FOLDED_SINE else 'open'
     return 'crossed' if sin(b - a) * sin(d - c) < 0.0 else 'open'
 
 

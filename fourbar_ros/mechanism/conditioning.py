@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from math import cos, hypot, nan, sin, sqrt
 
 from fourbar_ros.kernels.compiler import kernel
+from fourbar_ros.kernels.linear_algebra import Vector4
 from fourbar_ros.mechanism.closure import BRANCHES, ClosureError
 from fourbar_ros.mechanism.constants import Array, Constants, PAIRS
-from fourbar_ros.mechanism.forces import Four
 from fourbar_ros.mechanism.mechanism import Mechanism
 from fourbar_ros.mechanism.reduced import close_loop, pair_inertias, reduced_terms
 import numpy as np
@@ -144,7 +144,7 @@ def _evaluate(constants: Constants, cosine: float, sine: float, branch: float, w
 
 
 @kernel
-def motions(x: Four, y: Four) -> tuple[Array, Array, float]:
+def motions(x: Vector4, y: Vector4) -> tuple[Array, Array, float]:
     """
     Work out an orthonormal basis of the link rates that the closure admits.
 

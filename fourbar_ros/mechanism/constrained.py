@@ -12,11 +12,27 @@ one (docs/mechanics.md, change points). Vectors are in the frame of link a.
 
 from __future__ import annotations
 
-from math import cos, hypot, sin, sqrt
+from math import cos, sin, sqrt
 
 from fourbar_ros.kernels.compiler import kernel
+from fourbar_ros.kernels.linear_algebra import (
+    cholesky,
+    combine,
+    dot,
+    jacobi_rotation,
+    multiply,
+    solve_lower,
+    solve_upper,
+    Triangle,
+    Vector4,
+)
+from fourbar_ros.mechanism.change_points import (
+    FREE_CONSTRAINT_RATIO,
+    LONGEST_PASSAGE,
+    WEAK_CONSTRAINT_RATIO,
+)
 from fourbar_ros.mechanism.constants import Array, Constants
-from fourbar_ros.mechanism.forces import Four, generalized_forces, Surroundings
+from fourbar_ros.mechanism.forces import generalized_forces, Surroundings
 from fourbar_ros.mechanism.reduced import (
     move_centre,
     pair_inertias,
@@ -27,29 +43,14 @@ from fourbar_ros.mechanism.reduced import (
 from fourbar_ros.mechanism.state import SPIN, VELOCITY_X, VELOCITY_Y
 import numpy as np
 
-# Ratio of the singular values of the constraints below which the weaker direction is at a change
-# point: there it follows from the third derivative of the closure, and closure errors are left
-# alone, since removing them divides the rounding of an angle by this ratio. Lengths that differ
-# by less than its square (1e-8 of the length) count as equal.
-AT_CHANGE_POINT = 1e-4
-
-# The third derivative needs motion. It is weighted by the time [s] that the motion takes through
-# the neighbourhood of the change point, but at most by this; so that a linkage at rest, all but
-# rounding, is free to leave on either branch: below this ratio nothing constrains it.
-LONGEST_PASSAGE = 1.0
-LOST = 1e-9
-
 # Largest change of the acceleration between the two middle stages of a step, times the step and
 # relative to the rates; and the largest number of parts that a step is divided into to keep it.
 RESOLUTION = 1e-4
 MOST_PARTS = 256
 
-# A lower triangular (4, 4) matrix, row by row.
-Triangle = tuple[float, float, float, float, float, float, float, float, float, float]
-
 
 @kernel
-def directions(angles: Four) -> tuple[Four, Four]:
+def directions(angles: Vector4) -> tuple[Vector4, Vector4]:
     """Return cosines and sines of the link angles less that of link a."""
     b, c, d = angles[1] - angles[0], angles[2] - angles[0], angles[3] - angles[0]
     return (1.0, cos(b), cos(c), cos(d)), (0.0, sin(b), sin(c), sin(d))
@@ -57,9 +58,10 @@ def directions(angles: Four) -> tuple[Four, Four]:
 
 @kernel
 def constrained_accelerations(
-    angle_a: float, cosines: Four, sines: Four, rates: Four, velocity: tuple[float, float],
-    torques: Array, constants: Constants, around: Surroundings, weak_held: bool,
-) -> tuple[Four, tuple[float, float], float]:
+    angle_a: float, cosines: Vector4, sines: Vector4, rates: Vector4,
+    velocity: tuple[float, float], torques: Array, constants: Constants, around: Surroundings,
+    weak_held: bool,
+) -> tuple[Vector4, tuple[float, float], float]:
     """
     Solve the constrained form.
 
@@ -94,7 +96,7 @@ def constrained_accelerations(
     strong, weak, c, s = orthogonal_columns(factor, x, y)
     size, remains = dot(strong, strong), dot(weak, weak)
     need_strong, need_weak = c * need_x + s * need_y, c * need_y - s * need_x
-    if weak_held and remains < AT_CHANGE_POINT * AT_CHANGE_POINT * size:
+    if weak_held and remains < WEAK_CONSTRAINT_RATIO * WEAK_CONSTRAINT_RATIO * size:
         # Third derivative: J d(alpha)/dt - 3 sum s l e rate alpha - sum s l E e rate^3 = 0.
         cube = multiply(w, square)
         pull_x, pull_y = multiply(x, w), multiply(y, w)
@@ -106,14 +108,15 @@ def constrained_accelerations(
         need_third = c * third_y - s * third_x - along * need_strong
         length = sqrt(dot(third, third))
         if length > 0.0:
-            time = min(LONGEST_PASSAGE, AT_CHANGE_POINT * sqrt(size) / length)
+            time = min(LONGEST_PASSAGE, WEAK_CONSTRAINT_RATIO * sqrt(size) / length)
             # Ahead of the change point the two would cancel without this sign.
             if dot(third, weak) < 0.0:
                 time = -time
             weak = combine(1.0, weak, time, third)
             need_weak += time * need_third
             remains = dot(weak, weak)
-    share = need_weak / remains if weak_held and remains > LOST * LOST * size else 0.0
+    constrained = remains > FREE_CONSTRAINT_RATIO * FREE_CONSTRAINT_RATIO * size
+    share = need_weak / remains if weak_held and constrained else 0.0
     correction = combine(need_strong / size, strong, share, weak)
     accelerations = combine(1.0, free, 1.0, solve_upper(factor, correction))
     mass = constants.total_mass
@@ -223,8 +226,8 @@ def _advance_once(state: Array, start: Array, middle: Array, end: Array, step: f
 
 
 @kernel
-def project_onto_closure(angles: Four, rates: Four, constants: Constants, weak_held: bool
-                         ) -> tuple[Four, Four]:
+def project_onto_closure(angles: Vector4, rates: Vector4, constants: Constants, weak_held: bool
+                         ) -> tuple[Vector4, Vector4]:
     """
     Remove the closure error from angles and rates.
 
@@ -241,7 +244,7 @@ def project_onto_closure(angles: Four, rates: Four, constants: Constants, weak_h
     x, y = signed_links(cosines, sines, constants.lengths)
     strong, weak, c, s = orthogonal_columns(factor, x, y)
     size, remains = dot(strong, strong), dot(weak, weak)
-    held = weak_held and remains > AT_CHANGE_POINT * AT_CHANGE_POINT * size
+    held = weak_held and remains > WEAK_CONSTRAINT_RATIO * WEAK_CONSTRAINT_RATIO * size
     # J = (-y; x): the gap is (sum x, sum y) and opens at (-y . rates, x . rates).
     gap_x, gap_y = x[0] + x[1] + x[2] + x[3], y[0] + y[1] + y[2] + y[3]
     slip_x, slip_y = -dot(y, rates), dot(x, rates)
@@ -254,7 +257,7 @@ def project_onto_closure(angles: Four, rates: Four, constants: Constants, weak_h
 
 
 @kernel
-def rates_of_impulse(angles: Four, impulse: Four, constants: Constants) -> Four:
+def rates_of_impulse(angles: Vector4, impulse: Vector4, constants: Constants) -> Vector4:
     """
     Return how an impulse changes the rates of the links, the loop staying closed [rad/s].
 
@@ -267,25 +270,8 @@ def rates_of_impulse(angles: Four, impulse: Four, constants: Constants) -> Four:
 
 
 @kernel
-def combine(p: float, u: Four, q: float, v: Four) -> Four:
-    """Return p u + q v."""
-    return (p * u[0] + q * v[0], p * u[1] + q * v[1], p * u[2] + q * v[2], p * u[3] + q * v[3])
-
-
-@kernel
-def multiply(u: Four, v: Four) -> Four:
-    """Return the products of the components."""
-    return (u[0] * v[0], u[1] * v[1], u[2] * v[2], u[3] * v[3])
-
-
-@kernel
-def dot(u: Four, v: Four) -> float:
-    """Return the scalar product."""
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2] + u[3] * v[3]
-
-
-@kernel
-def _turned(cosines: Four, sines: Four, rates: Four, time: float) -> tuple[Four, Four]:
+def _turned(cosines: Vector4, sines: Vector4, rates: Vector4, time: float
+            ) -> tuple[Vector4, Vector4]:
     """Turn the directions on, at rates [rad/s] for a time [s]."""
     cb, sb = turn(cosines[1], sines[1], time * (rates[1] - rates[0]))
     cc, sc = turn(cosines[2], sines[2], time * (rates[2] - rates[0]))
@@ -294,29 +280,30 @@ def _turned(cosines: Four, sines: Four, rates: Four, time: float) -> tuple[Four,
 
 
 @kernel
-def _weighted_mean(first: Four, second: Four, third: Four, fourth: Four) -> Four:
+def _weighted_mean(first: Vector4, second: Vector4, third: Vector4, fourth: Vector4) -> Vector4:
     """Return the Runge-Kutta mean of order four."""
     return combine(1 / 6, combine(1.0, first, 1.0, fourth), 1 / 3, combine(
         1.0, second, 1.0, third))
 
 
 @kernel
-def _spin(cosines: Four, sines: Four, rates: Four, constants: Constants) -> tuple[float, float]:
+def _spin(cosines: Vector4, sines: Vector4, rates: Vector4, constants: Constants
+          ) -> tuple[float, float]:
     l_c, l_d = constants.lengths[2], constants.lengths[3]
     return spin(cosines[1], sines[1], l_c * cosines[2], l_c * sines[2], l_d * cosines[3],
                 l_d * sines[3], rates[0], rates[1], rates[2], rates[3], constants)
 
 
 @kernel
-def signed_links(cosines: Four, sines: Four, lengths: Array) -> tuple[Four, Four]:
+def signed_links(cosines: Vector4, sines: Vector4, lengths: Array) -> tuple[Vector4, Vector4]:
     """Return x and y of the links [m], with their signs in the closure."""
     signed = (-lengths[0], lengths[1], lengths[2], -lengths[3])
     return multiply(signed, cosines), multiply(signed, sines)
 
 
 @kernel
-def factored_inertia(cosines: Four, sines: Four, rates: Four, constants: Constants
-             ) -> tuple[Triangle, Four]:
+def factored_inertia(cosines: Vector4, sines: Vector4, rates: Vector4, constants: Constants
+             ) -> tuple[Triangle, Vector4]:
     """Factor M into L L^T, and evaluate the bias h."""
     l_c, l_d = constants.lengths[2], constants.lengths[3]
     m_ab, m_ac, m_ad, m_bc, m_bd, m_cd, n_ab, n_ac, n_ad, n_bc, n_bd, n_cd = pair_inertias(
@@ -325,58 +312,19 @@ def factored_inertia(cosines: Four, sines: Four, rates: Four, constants: Constan
     qa, qb, qc, qd = multiply(rates, rates)
     bias = (n_ab * qb + n_ac * qc + n_ad * qd, -n_ab * qa + n_bc * qc + n_bd * qd,
             -n_ac * qa - n_bc * qb + n_cd * qd, -n_ad * qa - n_bd * qb - n_cd * qc)
-    # Cholesky, with the inverse of the diagonal in its place.
-    m_aa, m_bb, m_cc, m_dd = (constants.own_inertias[0], constants.own_inertias[1],
-                              constants.own_inertias[2], constants.own_inertias[3])
-    aa = 1.0 / sqrt(m_aa)
-    ba, ca, da = m_ab * aa, m_ac * aa, m_ad * aa
-    bb = 1.0 / sqrt(m_bb - ba * ba)
-    cb, db = (m_bc - ba * ca) * bb, (m_bd - ba * da) * bb
-    cc = 1.0 / sqrt(m_cc - ca * ca - cb * cb)
-    dc = (m_cd - ca * da - cb * db) * cc
-    dd = 1.0 / sqrt(m_dd - da * da - db * db - dc * dc)
-    return (aa, ba, bb, ca, cb, cc, da, db, dc, dd), bias
+    own = constants.own_inertias
+    return cholesky((own[0], own[1], own[2], own[3]), m_ab, m_ac, m_ad, m_bc, m_bd, m_cd), bias
 
 
 @kernel
-def solve_lower(factor: Triangle, v: Four) -> Four:
-    """Solve L x = v."""
-    aa, ba, bb, ca, cb, cc, da, db, dc, dd = factor
-    a = v[0] * aa
-    b = (v[1] - ba * a) * bb
-    c = (v[2] - ca * a - cb * b) * cc
-    return a, b, c, (v[3] - da * a - db * b - dc * c) * dd
-
-
-@kernel
-def solve_upper(factor: Triangle, v: Four) -> Four:
-    """Solve L^T x = v."""
-    aa, ba, bb, ca, cb, cc, da, db, dc, dd = factor
-    d = v[3] * dd
-    c = (v[2] - dc * d) * cc
-    b = (v[1] - cb * c - db * d) * bb
-    return (v[0] - ba * b - ca * c - da * d) * aa, b, c, d
-
-
-@kernel
-def orthogonal_columns(factor: Triangle, x: Four, y: Four) -> tuple[Four, Four, float, float]:
+def orthogonal_columns(factor: Triangle, x: Vector4, y: Vector4
+                       ) -> tuple[Vector4, Vector4, float, float]:
     """
-    Turn the columns of `L^-1 J^T` into orthogonal ones, the larger one first.
-
-    One Jacobi rotation, so that a small singular value is known to full precision.
+    Rotate the columns of `L^-1 J^T` into orthogonal ones, the larger one first.
 
     :param x, y: the links with their signs [m]; J = (-y; x).
     :returns: the columns, and cosine and sine of the rotation.
     """
     first = solve_lower(factor, (-y[0], -y[1], -y[2], -y[3]))
     second = solve_lower(factor, x)
-    p, q, r = dot(first, first), dot(first, second), dot(second, second)
-    half = 0.5 * (p - r)
-    size = hypot(half, q)
-    c, s = 1.0, 0.0
-    if size > 0.0:
-        c = sqrt(0.5 * (1.0 + abs(half) / size))
-        s = 0.5 * q / (size * c)
-        if half < 0.0:
-            c, s = abs(s), (c if q >= 0.0 else -c)
-    return combine(c, first, s, second), combine(c, second, -s, first), c, s
+    return jacobi_rotation(first, second)

@@ -14,12 +14,11 @@ from math import cos, sin, sqrt
 
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.kernels.compiler import kernel
+from fourbar_ros.kernels.linear_algebra import Vector4
 from fourbar_ros.mechanism.constants import Array, Constants, record
 from fourbar_ros.mechanism.mechanism import numbers
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-Four = tuple[float, float, float, float]
 
 
 class ForceError(FourbarError):
@@ -109,7 +108,7 @@ def force_on_link(link: int, velocity_x: float, velocity_y: float, constants: Co
 
 
 @kernel
-def torques_on_links(rates: Four, around: Surroundings) -> Four:
+def torques_on_links(rates: Vector4, around: Surroundings) -> Vector4:
     """Evaluate the torques on the four links [N m] at their rates [rad/s]."""
     rate_a, rate_b, rate_c, rate_d = rates
     first = _joint_torque(0, rate_b - rate_a, around)
@@ -145,9 +144,9 @@ def grip(rate: float, static_ratio: float, stribeck_rate: float, smoothing: floa
 
 @kernel
 def generalized_forces(
-    cosines: Four, sines: Four, rates: Four, velocity: tuple[float, float],
+    cosines: Vector4, sines: Vector4, rates: Vector4, velocity: tuple[float, float],
     constants: Constants, around: Surroundings,
-) -> tuple[Four, tuple[float, float]]:
+) -> tuple[Vector4, tuple[float, float]]:
     """
     Sum up all effects as generalized forces on the four link angles and the mass centre.
 
@@ -207,7 +206,7 @@ def _lever(cosine: float, sine: float, arm: Array) -> tuple[float, float]:
 
 
 @kernel
-def losses(cosines: Four, sines: Four, rates: Four, velocity: tuple[float, float],
+def losses(cosines: Vector4, sines: Vector4, rates: Vector4, velocity: tuple[float, float],
            constants: Constants, around: Surroundings
            ) -> tuple[float, float, float]:
     """
@@ -233,7 +232,7 @@ def losses(cosines: Four, sines: Four, rates: Four, velocity: tuple[float, float
 
 
 @kernel
-def lost_in_joints(rates: Four, around: Surroundings) -> float:
+def lost_in_joints(rates: Vector4, around: Surroundings) -> float:
     """Evaluate the power that friction in the joints takes at the links' rates [W]."""
     rate_a, rate_b, rate_c, rate_d = rates
     relative = (rate_b - rate_a, rate_c - rate_b, rate_c - rate_d, rate_d - rate_a)
@@ -244,7 +243,7 @@ def lost_in_joints(rates: Four, around: Surroundings) -> float:
 
 
 @kernel
-def _place(link: int, cosines: Four, sines: Four, rates: Four, constants: Constants
+def _place(link: int, cosines: Vector4, sines: Vector4, rates: Vector4, constants: Constants
            ) -> tuple[float, float, float, float]:
     """Return where the mass centre of a link is [m], and its velocity [m/s], from the whole's."""
     x = y = speed_x = speed_y = 0.0

@@ -14,6 +14,7 @@ from threading import Lock
 from typing import Any
 
 from fourbar_ros.kernels.compiler import kernel, prange
+from fourbar_ros.mechanism.change_points import REDUCED_FORM_LIMIT
 from fourbar_ros.mechanism.compliant import advance_compliant
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.constrained import (
@@ -24,7 +25,6 @@ from fourbar_ros.mechanism.constrained import (
 from fourbar_ros.mechanism.forces import Surroundings
 from fourbar_ros.mechanism.reduced import (
     advance_reduced,
-    NEAR_ALIGNMENT,
     reduced_accelerations,
     side_of_joint_3,
 )
@@ -85,7 +85,7 @@ def evaluate(state: Array, torques: Array, constants: Constants, around: Surroun
     a, b, c, d, ax, ay, _, _, fold = reduced_accelerations(
         state[0], cos(theta), sin(theta), side_of_joint_3(state[2], state[3]),
         state[4], state[5], vx, vy, torques, constants, around)
-    if not fold > NEAR_ALIGNMENT * constants.lengths[2] * constants.lengths[3]:
+    if not fold > REDUCED_FORM_LIMIT * constants.lengths[2] * constants.lengths[3]:
         cosines, sines = directions((state[0], state[1], state[2], state[3]))
         (a, b, c, d), (ax, ay), _ = constrained_accelerations(
             state[0], cosines, sines, (state[4], state[5], state[6], state[7]), (vx, vy),

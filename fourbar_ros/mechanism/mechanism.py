@@ -13,6 +13,7 @@ from typing import Any
 from fourbar_ros.common.config_files import config_file, load_yaml
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.settings import check_keys
+from fourbar_ros.mechanism.change_points import LENGTH_ROUNDING, MATCHING_LENGTHS
 from fourbar_ros.mechanism.constants import Array, Constants, constants_of
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,13 +30,7 @@ JOINT_LINKS = ((0, 1), (1, 2), (2, 3), (3, 0))
 
 # Which links line up against the others at a change point: a and d against b and c (parallelogram,
 # theta = 0), a and b against c and d (theta = pi), a and c against b and d.
-CHANGE_POINTS = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
-# Lengths that match this closely, relative to their mean, are made to match. No linkage is made
-# so well; in between, double precision resolves neither a passage nor a fold.
-MATCHING = 1e-8
-# What adding up the lengths rounds off is no mismatch.
-ROUNDING = 1e-15
-
+ALIGNMENTS = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
 
 # Least values of those that need not be positive.
 LOWEST = {'com_positions': -np.inf, 'link_angle_offsets': -np.inf, 'joint_damping': 0.0,
@@ -51,8 +46,8 @@ class Mechanism:
     """
     A closed loop of four rigid links, one flywheel on each (order a, b, c, d; SI units).
 
-    Lengths that miss a change point, where all links lie on a line, by less than `MATCHING` are
-    made to meet it.
+    Lengths that miss a change point, where all links lie on a line, by less than
+    `MATCHING_LENGTHS` are made to meet it.
 
     :param link_lengths: (4,) distance between the two joints of each link [m].
     :param link_masses: (4,) mass of each link with its flywheel [kg].
@@ -114,10 +109,10 @@ class Mechanism:
                 f'{self.link_lengths[longest]:g} m long, the other three reach {others:g} m')
 
     def _match_lengths(self) -> None:
-        missing = CHANGE_POINTS @ self.link_lengths
+        missing = ALIGNMENTS @ self.link_lengths
         relative = np.abs(missing) / self.link_lengths.mean()
-        missing[(relative < ROUNDING) | (relative >= MATCHING)] = 0.0
-        matched = self.link_lengths - missing / 4.0 @ CHANGE_POINTS
+        missing[(relative < LENGTH_ROUNDING) | (relative >= MATCHING_LENGTHS)] = 0.0
+        matched = self.link_lengths - missing / 4.0 @ ALIGNMENTS
         matched.flags.writeable = False
         object.__setattr__(self, 'link_lengths', matched)
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 from math import atan2, cos, pi, sin, sqrt
 
 from fourbar_ros.kernels.compiler import kernel
+from fourbar_ros.mechanism.change_points import REDUCED_FORM_LIMIT
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.forces import generalized_forces, Surroundings
 from fourbar_ros.mechanism.state import (
@@ -31,10 +32,6 @@ from fourbar_ros.mechanism.state import (
     VELOCITY_Y,
 )
 import numpy as np
-
-# Below this |sin(phi_d - phi_c)| the constrained form takes over: the reduced one loses about
-# 1 / |sin|^2 in accuracy.
-NEAR_ALIGNMENT = 0.3
 
 # Up to this angle [rad] the first four terms of the series of sine and cosine are exact.
 SMALL_TURN = 0.02
@@ -228,7 +225,7 @@ def advance_reduced(state: Array, start: Array, middle: Array, end: Array, step:
     :returns: False where the step comes near alignment; then nothing was changed.
     """
     lengths = constants.lengths
-    limit = NEAR_ALIGNMENT * lengths[2] * lengths[3]
+    limit = REDUCED_FORM_LIMIT * lengths[2] * lengths[3]
     angle_a, angle_b, rate_a, rate_b = state[0], state[1], state[4], state[5]
     vx, vy = state[VELOCITY_X], state[VELOCITY_Y]
     theta = angle_b - angle_a
@@ -324,7 +321,7 @@ def close_reduced(state: Array, constants: Constants) -> bool:
     c, s = cos(state[1] - state[0]), sin(state[1] - state[0])
     side = side_of_joint_3(state[2], state[3])
     cx, cy, dx, dy, fold, inverse_fold = close_loop(c, s, side, lengths)
-    if not abs(fold) > NEAR_ALIGNMENT * lengths[2] * lengths[3]:
+    if not abs(fold) > REDUCED_FORM_LIMIT * lengths[2] * lengths[3]:
         return False
     g1, g2, g3, g4 = gammas(c, s, cx, cy, dx, dy, inverse_fold, lengths)
     state[2] = _nearest_turn(state[0] + atan2(cy, cx), state[2])

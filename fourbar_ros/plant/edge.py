@@ -9,9 +9,10 @@ from math import cos, inf, sin
 from typing import Any
 
 from fourbar_ros.kernels.compiler import kernel
+from fourbar_ros.kernels.linear_algebra import dot
 from fourbar_ros.mechanism.compliant import links_energy_and_spin
 from fourbar_ros.mechanism.constants import Array, Constants
-from fourbar_ros.mechanism.constrained import dot, rates_of_impulse
+from fourbar_ros.mechanism.constrained import rates_of_impulse
 from fourbar_ros.mechanism.state import CENTRE_X, CENTRE_Y, SPIN, VELOCITY_X, VELOCITY_Y
 import numpy as np
 from numpy.typing import NDArray

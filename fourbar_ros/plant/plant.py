@@ -15,6 +15,7 @@ from math import isfinite
 
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.mechanism import assemble, LINK_NAMES, Mechanism
+from fourbar_ros.mechanism.change_points import RATES_UNDETERMINED
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix, mass_matrix
 from fourbar_ros.mechanism.state import (
@@ -30,6 +31,7 @@ from fourbar_ros.plant.bearings import drives_of
 from fourbar_ros.plant.edge import joint_levers, joint_motion
 from fourbar_ros.plant.energy_budget import balance, CONTACTS, EnergyBudget, nothing_added
 from fourbar_ros.plant.sensors import LinkSensors
+from fourbar_ros.plant.settings import InitialState
 from fourbar_ros.plant.step import (
     advance_plant,
     Boxed,
@@ -54,23 +56,6 @@ RELATIVE = np.array([[-1, 1, 0, 0], [0, -1, 1, 0], [0, 0, -1, 1], [1, 0, 0, -1]]
 
 class PlantError(FourbarError):
     """A plant that cannot be simulated as asked, or whose state left the finite numbers."""
-
-
-@dataclass(frozen=True)
-class InitialState:
-    """
-    Where the linkage starts, wheels at rest relative to their links.
-
-    :param link_a, link_b: orientations [rad].
-    :param branch: `open` or `crossed`.
-    :param rate_a, rate_b: angular rates [rad/s].
-    """
-
-    link_a: float = 0.0
-    link_b: float = np.pi / 3
-    branch: str = 'open'
-    rate_a: float = 0.0
-    rate_b: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,13 +280,10 @@ def quantise(angles: Array, step: float) -> Array:
 
 
 def _initial_state(mechanism: Mechanism, initial: InitialState) -> Array:
-    for name in ('link_a', 'link_b', 'rate_a', 'rate_b'):
-        if not isfinite(getattr(initial, name)):
-            raise PlantError(f'initial {name} must be finite, got {getattr(initial, name)}')
     angles = assemble(mechanism, initial.link_a, initial.link_b, initial.branch)
     rates = np.array([initial.rate_a, initial.rate_b, 0.0, 0.0])
     if rates.any():
-        if abs(np.sin(angles[3] - angles[2])) < 1e-9:
+        if abs(np.sin(angles[3] - angles[2])) < RATES_UNDETERMINED:
             raise PlantError(
                 f'initial rates are given at a change point ({LINK_NAMES[2]} and {LINK_NAMES[3]} '
                 'on a line), where they do not determine the motion')

@@ -21,10 +21,8 @@ from fourbar_ros.control.computed_torque import (
     BRANCH_RATE,
     CONDITION,
     demanded,
-    FULL_HOLD,
     HOLD,
     hold_on_branch,
-    NO_HOLD,
     TERMS,
 )
 from fourbar_ros.mechanism import (
@@ -34,6 +32,7 @@ from fourbar_ros.mechanism import (
     reduced_form,
     ReducedForm,
 )
+from fourbar_ros.mechanism.change_points import HOLD_FADES_FROM, HOLD_FADES_TO
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -258,9 +257,9 @@ def test_hold_is_full_at_change_points_and_fades_without_a_corner() -> None:
     """From a cubic: its slope is no more than 1.5 / width, the change of that 6 / width^2."""
     theta = np.linspace(-pi, 2.0 * pi, 30_001)
     hold, sizes = np.array([hold_on_branch(angle) for angle in theta]), np.abs(np.sin(theta))
-    assert (hold[sizes <= FULL_HOLD] == 1.0).all()
-    assert (hold[sizes >= NO_HOLD] == 0.0).all()
-    step, width = theta[1] - theta[0], NO_HOLD - FULL_HOLD
+    assert (hold[sizes <= HOLD_FADES_FROM] == 1.0).all()
+    assert (hold[sizes >= HOLD_FADES_TO] == 0.0).all()
+    step, width = theta[1] - theta[0], HOLD_FADES_TO - HOLD_FADES_FROM
     assert np.abs(np.diff(hold)).max() <= 1.5 / width * step
     assert np.abs(np.diff(hold, 2)).max() <= (6.0 / width ** 2 + 1.5 / width) * step ** 2
     order = np.argsort(sizes)

@@ -18,11 +18,12 @@ from fourbar_ros.control import (
 )
 from fourbar_ros.control.actuation_cost import COPPER, EQ9, FLYWHEEL_ENERGY, WORK
 from fourbar_ros.control.allocation import AllocationError
-from fourbar_ros.control.controller import LOST_IN_A_ROW, NO_HOLD
+from fourbar_ros.control.controller import LOST_IN_A_ROW
 from fourbar_ros.control.reference_generator import STOPPING_TIME
 from fourbar_ros.control.tracking_law import SHARED_OUT
 from fourbar_ros.mechanism import assemble, kinetic_energy, Mechanism
 from fourbar_ros.mechanism.angles import wrap_angles
+from fourbar_ros.mechanism.change_points import TORQUE_CUTOFF
 from fourbar_ros.plant import InitialState
 import numpy as np
 from numpy.typing import NDArray
@@ -243,7 +244,7 @@ def near_change_point(name: str) -> tuple[Mechanism, Array]:
 @pytest.mark.parametrize('name', ['antiparallelogram', 'unequal'])
 def test_at_a_change_point_off_the_parallelogram_the_wheels_coast(name: str) -> None:
     mechanism, angles = near_change_point(name)
-    assert abs(np.sin(angles[3] - angles[2])) < NO_HOLD
+    assert abs(np.sin(angles[3] - angles[2])) < TORQUE_CUTOFF
     controller = Controller(mechanism, ControllerSettings())
     controller.device_armed(True)
     for tick in range(3):

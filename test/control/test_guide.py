@@ -8,9 +8,10 @@ from __future__ import annotations
 from math import pi, sin
 
 from fourbar_ros.control.reference_generator import ReferenceGenerator, STOPPING_TIME
-from fourbar_ros.control.setpoint import CHANGE_POINT_MARGIN, follow
+from fourbar_ros.control.setpoint import follow
 from fourbar_ros.control.soft_step import SoftStep
 from fourbar_ros.mechanism import assemble, closure_error, Mechanism, reduced_form
+from fourbar_ros.mechanism.change_points import PLANNING_MARGIN
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -202,7 +203,7 @@ def test_it_comes_to_rest_before_a_change_point(
     reached, speeds, _ = run(guide, 10 ** 9, STOPPING_TIME)
     sines = np.abs(np.sin(reached[:, 3] - reached[:, 2]))
     assert sines[-1] < sine or at_once
-    assert sines.min() >= CHANGE_POINT_MARGIN - 1e-6
+    assert sines.min() >= PLANNING_MARGIN - 1e-6
     assert not speeds[-1].any()
 
 

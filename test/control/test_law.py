@@ -12,7 +12,7 @@ from math import pi
 from fourbar_ros.control import ControllerSettings
 from fourbar_ros.control.allocation import AllocationError, ALLOCATIONS
 from fourbar_ros.control.branch import Branch, BRANCHES, PARALLELOGRAM
-from fourbar_ros.control.computed_torque import BRANCH_A, BRANCH_B, HOLD, NO_HOLD
+from fourbar_ros.control.computed_torque import BRANCH_A, BRANCH_B, HOLD
 from fourbar_ros.control.reference_generator import ReferenceGenerator
 from fourbar_ros.control.tracking_law import (
     Decision,
@@ -21,6 +21,7 @@ from fourbar_ros.control.tracking_law import (
     TrackingLaw,
 )
 from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism, reduced_form
+from fourbar_ros.mechanism.change_points import HOLD_FADES_TO
 from fourbar_ros.mechanism.motors import available_torque, motors_of
 import numpy as np
 from numpy.typing import NDArray
@@ -202,7 +203,7 @@ def test_torques_change_without_a_corner_where_the_hold_fades(
 
     def largest(count: int) -> float:
         torques = []
-        for theta in np.linspace(0.02, np.arcsin(NO_HOLD) + 0.1, count):
+        for theta in np.linspace(0.02, np.arcsin(HOLD_FADES_TO) + 0.1, count):
             angles = np.array([0.0, theta, 0.0, theta])
             guide = guide_at(mechanism, angles + [0.01, -0.02, 0.005, 0.01], NONE, NONE)
             guide.branch = PARALLELOGRAM

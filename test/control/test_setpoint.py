@@ -11,7 +11,6 @@ from typing import Any
 from fourbar_ros.control import SetpointError
 from fourbar_ros.control.branch import on_parallelogram
 from fourbar_ros.control.setpoint import (
-    CHANGE_POINT_MARGIN,
     check_names,
     follow,
     plan,
@@ -24,6 +23,7 @@ from fourbar_ros.mechanism import (
     LINK_NAMES,
     Mechanism,
 )
+from fourbar_ros.mechanism.change_points import PLANNING_MARGIN
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -299,8 +299,8 @@ def test_opposite_links_stand_for_each_other(
 def passes_change_point(begin: float, end: float) -> bool:
     """Tell whether theta meets a change point between two values, by the margin, by itself."""
     low, high = min(begin, end), max(begin, end)
-    multiple = np.ceil((low - np.arcsin(CHANGE_POINT_MARGIN)) / pi) * pi
-    return bool(multiple - np.arcsin(CHANGE_POINT_MARGIN) < high)
+    multiple = np.ceil((low - np.arcsin(PLANNING_MARGIN)) / pi) * pi
+    return bool(multiple - np.arcsin(PLANNING_MARGIN) < high)
 
 
 @pytest.mark.parametrize('seed', range(300))

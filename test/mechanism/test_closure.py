@@ -15,11 +15,11 @@ from fourbar_ros.mechanism import (
     nearest_assembly,
     reduced_form,
 )
+from fourbar_ros.mechanism.change_points import FOLDED_SINE
 from fourbar_ros.mechanism.closure import (
     assemble_along,
     BRANCHES,
     check_motion,
-    FOLDED,
     solve_pair,
     TOLERANCE,
     wrap,
@@ -301,7 +301,7 @@ def test_change_point_itself_is_not_folded(theta: float) -> None:
 @pytest.mark.parametrize(('within', 'branch'), [(0.5, 'folded'), (2.0, 'crossed')])
 def test_fold_is_one_up_to_a_small_angle(within: float, branch: str) -> None:
     """In a linkage that does not quite match the pairs lie on each other only nearly."""
-    small = within * FOLDED
+    small = within * FOLDED_SINE
     assert branch_of([0.0, small, 1.0, 1.0 - small]) == branch
 
 

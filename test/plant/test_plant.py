@@ -4,9 +4,11 @@
 """What the simulated table owes to physics, to its motors' limits and to its sensors."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from math import inf, nan, pi
 
+from fourbar_ros.common.settings import SettingError
 from fourbar_ros.mechanism import (
     angular_momentum,
     closure_error,
@@ -14,6 +16,7 @@ from fourbar_ros.mechanism import (
     kinetic_energy,
     Mechanism,
 )
+from fourbar_ros.mechanism.closure import BRANCHES
 from fourbar_ros.plant import InitialState, Plant, PlantError, Table, Truth
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelEncoders
@@ -250,9 +253,11 @@ def test_step_that_is_no_positive_number_is_refused(step: float, make_plant: Mak
 
 @pytest.mark.parametrize('name', ['link_a', 'link_b', 'rate_a', 'rate_b'])
 @pytest.mark.parametrize('value', [nan, inf, -inf])
-def test_initial_state_must_be_finite(name: str, value: float, make_plant: MakePlant) -> None:
-    with pytest.raises(PlantError, match=f'initial {name} must be finite, got {value}'):
-        make_plant(initial=replace(InitialState(), **{name: value}))
+def test_initial_state_must_be_finite(
+    name: str, value: float, refuses: Callable[..., AbstractContextManager[None]],
+) -> None:
+    with refuses(SettingError, name=f'initial.{name}', value=value):
+        replace(InitialState(), **{name: value})
 
 
 @pytest.mark.parametrize('theta', [0.0, pi])
@@ -272,8 +277,13 @@ def test_initial_angles_that_cannot_close_are_refused(
     long = replace(uneven, link_lengths=np.array([0.3, 0.3, 0.2, 0.2]))
     with pytest.raises(ClosureError, match='link_b = 3'):
         make_plant(long, initial=InitialState(0.0, 3.0))
-    with pytest.raises(ClosureError, match='folded'):
-        make_plant(initial=InitialState(branch='folded'))
+
+
+def test_initial_branch_is_one_that_can_be_assembled(
+    refuses: Callable[..., AbstractContextManager[None]],
+) -> None:
+    with refuses(SettingError, name='initial.branch', value='folded', limit=BRANCHES):
+        InitialState(branch='folded')
 
 
 def test_state_out_of_the_finite_numbers_is_an_error(

@@ -17,15 +17,14 @@ from typing import Protocol
 from fourbar_ros.analysis.bags import Floats
 from fourbar_ros.analysis.calibration.quantity import CalibrationError
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, Mechanism, reduced_form
+from fourbar_ros.mechanism.change_points import EXCITATION_CLEARANCE
 import numpy as np
 
 # Share of the motors' limits that is used.
 TORQUE_SHARE = 0.4
 SPEED_SHARE = 0.9
-# How near the links may come to a change point, as the angle between links c and d [rad].
-LEAST_CLEARANCE = np.radians(10.0)
 # At twice of which a wheel's turn is cut short, since what comes next drives the links back.
-TURN_BACK = 2.0 * LEAST_CLEARANCE
+TURN_BACK = 2.0 * EXCITATION_CLEARANCE
 # A wheel slower than this is left alone [rad/s].
 RESTING = 3.0
 # Links that turn by less in a while are at rest; joints stop them by and by [rad, s].
@@ -70,7 +69,7 @@ class _Guard:
         now = clearance(link_angles)
         if self._least is None:
             # Links that are held in a jig may be held anywhere.
-            self._least = min(LEAST_CLEARANCE, 0.8 * now)
+            self._least = min(EXCITATION_CLEARANCE, 0.8 * now)
         if now < self._least:
             raise CalibrationError(
                 f'links c and d came within {np.degrees(now):.1f} deg of a line, limit '
