@@ -13,9 +13,9 @@ from fourbar_ros.analysis.calibration.links import link_estimate
 from fourbar_ros.analysis.calibration.signals import link_signal, LinkSignal, WheelSignal
 from fourbar_ros.analysis.calibration.wheels import wheel_estimate
 from fourbar_ros.control import Controller, ControllerSettings
-from fourbar_ros.device import SimulatedTable
 from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.device.interface import no_torque
+from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.estimation import Estimator, EstimatorSettings
 from fourbar_ros.estimation.bias_detection import ALARM
 from fourbar_ros.loop.run import make_loop

@@ -1,7 +1,12 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a testbed is, simulated or real: samples in, torques out, and when it may be driven."""
+"""
+Testbeds behind one interface, simulated or real: samples, commands, arming, clock modes.
+
+The simulated table is not imported here (`fourbar_ros.device.simulated`), so that a node for real
+hardware loads no plant.
+"""
 
 from fourbar_ros.device.arming import ArmingGate, DeviceState
 from fourbar_ros.device.clock_modes import (
@@ -20,16 +25,17 @@ from fourbar_ros.device.interface import (
     Device,
     DeviceFault,
     Drive,
+    LinkSample,
     Reaction,
     Samples,
+    TrueState,
     WheelSample,
 )
-from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.device.supervisor import DeviceSupervisor, SupervisorSettings, Timing
 
 __all__ = [
     'ArmingGate', 'ClockLimit', 'ClockMode', 'ClockModeError', 'Device', 'DeviceFault',
-    'DeviceState', 'DeviceSupervisor', 'Drive', 'drive_by_name', 'FastClock', 'LockstepClock',
-    'LockstepGuard', 'Participants', 'Reaction', 'RealtimeClock', 'Recovery', 'Samples',
-    'SimulatedTable', 'SupervisorSettings', 'Timing', 'WheelSample',
+    'DeviceState', 'DeviceSupervisor', 'Drive', 'drive_by_name', 'FastClock', 'LinkSample',
+    'LockstepClock', 'LockstepGuard', 'Participants', 'Reaction', 'RealtimeClock', 'Recovery',
+    'Samples', 'SupervisorSettings', 'Timing', 'TrueState', 'WheelSample',
 ]

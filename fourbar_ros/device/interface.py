@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a testbed offers, whether it is simulated or stands in the lab."""
+"""The interface between the supervisor and a testbed, simulated or real."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from typing import Protocol
 from fourbar_ros.device.arming import DeviceState
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.constants import Array
-from fourbar_ros.plant import SensorReading, Truth
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,6 +39,24 @@ def no_torque() -> Drive:
 
 
 @dataclass(frozen=True, eq=False)
+class LinkSample:
+    """
+    Samples of link-angle sensors that were measured at one instant.
+
+    :param stamp_ns: time of measurement [ns].
+    :param names: sensors that have a sample, in the order of the device's `sensor_names`.
+    :param angles: (n,) orientation of each link in frame `table`, or of a joint's second link
+        relative to its first, in (-pi, pi] [rad].
+    :param rates: (n,) angular rates [rad/s], or (0,) without gyros.
+    """
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    angles: Array
+    rates: Array
+
+
+@dataclass(frozen=True, eq=False)
 class WheelSample:
     """
     The four wheels at a tick.
@@ -55,22 +72,51 @@ class WheelSample:
 
 
 @dataclass(frozen=True, eq=False)
+class TrueState:
+    """
+    The state of a simulated device without sensors and their errors.
+
+    :param link_angles: (4,) continuous [rad].
+    :param link_rates: (4,) [rad/s].
+    :param wheel_angles: (4,) relative to the link, unwrapped [rad].
+    :param wheel_speeds: (4,) relative to the link [rad/s].
+    :param efforts: (4,) torque of each motor, mean over the last control period [N m].
+    :param walked_torques: (2,) random-walk torques on links a and b in that period [N m].
+    :param centre_position: (2,) centre of mass of the whole in frame `table` [m].
+    :param centre_velocity: (2,) [m/s].
+    :param base_position: (2,) joint 1, the origin of the frame of link a [m].
+    :param base_velocity: (2,) [m/s].
+    """
+
+    link_angles: Array
+    link_rates: Array
+    wheel_angles: Array
+    wheel_speeds: Array
+    efforts: Array
+    walked_torques: Array
+    centre_position: Array
+    centre_velocity: Array
+    base_position: Array
+    base_velocity: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Samples:
     """
-    Everything that a testbed has to say at a tick.
+    All samples of a device at a tick.
 
     :param stamp_ns: the tick [ns].
-    :param links: what the sensors of the links measured since the last one.
-    :param wheels: as they are, or were when all of them were last heard.
-    :param truth: only where it is simulated.
-    :param complete: whether all wheels were heard lately enough; if not, this is no tick.
-    :param timing: of the device's own, in the order of its `timing_names`; None is not known.
+    :param links: samples of the link-angle sensors that arrived since the last tick.
+    :param wheels: present wheels, or their last known state.
+    :param truth: state without sensors, None on a real device.
+    :param complete: whether every wheel has answered recently; if not, no tick is published.
+    :param timing: the device's own timing, in the order of its `timing_names`; None: unknown.
     """
 
     stamp_ns: int
-    links: tuple[SensorReading, ...]
+    links: tuple[LinkSample, ...]
     wheels: WheelSample
-    truth: Truth | None = None
+    truth: TrueState | None = None
     complete: bool = True
     timing: Sequence[float | None] = ()
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.named_values import RejectedError
+from fourbar_ros.common.settings import setting, Settings
 from fourbar_ros.device.arming import ArmingGate, DeviceState
 from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.device.interface import Device, Drive, no_torque, Reaction, Samples
@@ -30,21 +31,27 @@ LONGEST_WAIT = 100
 
 
 @dataclass(frozen=True)
-class SupervisorSettings:
+class SupervisorSettings(Settings):
     """
-    When to stop by itself, and how.
+    Control rate, watchdogs and reaction of the supervisor; common to every device.
 
-    :param command_timeout_s: longest time without a command while armed [s].
-    :param sensor_timeout_s: a link sensor without a sample for so long is silent [s].
-    :param timeout_action: what the wheels do when commands stay away: `coast` (no power),
-        `hold_speed` or `brake` (to rest relative to the link, which turns the links).
+    `timeout_action` is `coast` (no power), `hold_speed`, or `brake` (to rest relative to the link;
+    the momentum of the wheels goes into the links).
     """
 
-    __test__ = False    # not a test class, whatever its name
+    rate: float = setting(
+        250.0, 'Hz', 'control rate, one tick per period', low=1.0, high=2000.0)
+    command_timeout: float = setting(
+        0.1, 's', 'longest time without a command while armed', low=0.002, high=10.0)
+    sensor_timeout: float = setting(
+        0.2, 's', 'a link without a sample for this time blocks arming', low=0.002, high=10.0)
+    timeout_action: str = setting(
+        'coast', '', 'reaction of the wheels when commands time out', choices=TIMEOUT_ACTIONS)
 
-    command_timeout_s: float = 0.1
-    sensor_timeout_s: float = 0.2
-    timeout_action: str = 'coast'
+    @property
+    def period_ns(self) -> int:
+        """Time between two ticks [ns]."""
+        return round(1e9 / self.rate)
 
 
 @dataclass(frozen=True)
@@ -73,8 +80,6 @@ class DeviceSupervisor:
     :ivar clipped: number of commands that asked more than a motor has.
     :ivar last_rejection: what was wrong with the last rejected command, or ''.
     """
-
-    __test__ = False
 
     def __init__(self, device: Device, settings: SupervisorSettings) -> None:
         self.device = device
@@ -176,10 +181,10 @@ class DeviceSupervisor:
         """
         silent = [name for name in self.device.sensor_names
                   if name not in self._seen_ns
-                  or self._now_ns - self._seen_ns[name] > self._settings.sensor_timeout_s * 1e9]
+                  or self._now_ns - self._seen_ns[name] > self._settings.sensor_timeout * 1e9]
         if silent:
             arming_blockers = [*arming_blockers, f'no sample from {", ".join(silent)} for '
-                                     f'{self._settings.sensor_timeout_s:g} s']
+                                     f'{self._settings.sensor_timeout:g} s']
         arming_blockers = [*arming_blockers, *self.device.arming_blockers()]
         was_armed = self.gate.armed
         armed, message = self.gate.arm(self._now_ns, arming_blockers)
@@ -269,9 +274,9 @@ class DeviceSupervisor:
         if self._tick_ns is None:
             raise RejectedError('stale', 'no tick to answer yet')
         age_s = (self._tick_ns - stamp_ns) * 1e-9
-        if age_s > self._settings.command_timeout_s:
+        if age_s > self._settings.command_timeout:
             raise RejectedError('stale', f'stamp is {age_s:g} s older than the last tick, limit '
-                                        f'{self._settings.command_timeout_s:g} s')
+                                        f'{self._settings.command_timeout:g} s')
         if age_s < 0.0:
             raise RejectedError('stale', f'stamp is {-age_s:g} s ahead of the last tick')
         if self._command_stamp_ns is not None and stamp_ns < self._command_stamp_ns:
@@ -304,9 +309,9 @@ class DeviceSupervisor:
         if not self.gate.armed:
             return
         last_ns = max(self._armed_steady_ns, self._command_steady_ns or 0)
-        if monotonic_ns - last_ns > self._settings.command_timeout_s * 1e9:
+        if monotonic_ns - last_ns > self._settings.command_timeout * 1e9:
             self.gate.disarm(
-                stamp_ns, f'no flywheel_command for {self._settings.command_timeout_s:g} s')
+                stamp_ns, f'no flywheel_command for {self._settings.command_timeout:g} s')
             if self._settings.timeout_action == 'hold_speed':
                 self._parked = _at_speeds(self._wheel_speeds)
             elif self._settings.timeout_action == 'brake':

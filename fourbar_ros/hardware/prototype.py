@@ -20,6 +20,7 @@ from fourbar_ros.device.interface import (
     Device,
     DeviceFault,
     Drive,
+    LinkSample,
     no_torque,
     Samples,
     WheelSample,
@@ -46,7 +47,6 @@ from fourbar_ros.hardware.messages import (
 from fourbar_ros.hardware.safety_monitor import SafetyMonitor
 from fourbar_ros.hardware.safety_table import SafetyTable
 from fourbar_ros.mechanism import LINK_NAMES, Mechanism
-from fourbar_ros.plant import SensorReading
 import numpy as np
 
 LINKS = range(4)
@@ -386,7 +386,7 @@ class Prototype(Device):
                         continue
                     self._rateless.discard(name)
                     rates = np.array([rate])
-                readings.append(SensorReading(
+                readings.append(LinkSample(
                     measured_ns + shift_ns, (name,),
                     np.array([np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi]), rates))
         readings.sort(key=lambda reading: reading.stamp_ns)

@@ -10,7 +10,8 @@ from dataclasses import replace
 
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.control import Controller, SetpointError
-from fourbar_ros.device import DeviceSupervisor, SimulatedTable, SupervisorSettings
+from fourbar_ros.device import DeviceSupervisor, SupervisorSettings
+from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.estimation import Estimator
 from fourbar_ros.loop.closed_loop import ClosedLoop, Step
 from fourbar_ros.loop.recording import Recording
@@ -34,7 +35,7 @@ def make_loop(scenario: Scenario) -> ClosedLoop:
     plant = Plant(scenario.mechanism, scenario.table, scenario.initial, settings.step,
                   np.random.default_rng(scenario.seed))
     testbed = DeviceSupervisor(SimulatedTable(plant, settings.period_ns), SupervisorSettings(
-        settings.command_timeout, settings.sensor_timeout, settings.timeout_action))
+        settings.rate, settings.command_timeout, settings.sensor_timeout, settings.timeout_action))
     return ClosedLoop(testbed, Estimator(scenario.believed, scenario.estimator),
                       Controller(scenario.believed, scenario.controller))
 

@@ -18,10 +18,10 @@ from typing import Any, cast, TypeVar
 
 from fourbar_ros.common.config_files import config_file, load_yaml
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.common.settings import check_keys, Setting
+from fourbar_ros.common.settings import check_keys, Setting, settings_of
 from fourbar_ros.control import ControllerSettings
 from fourbar_ros.control.parameters import SETTINGS as CONTROLLER
-from fourbar_ros.device.supervisor import TIMEOUT_ACTIONS
+from fourbar_ros.device import SupervisorSettings
 from fourbar_ros.estimation import EstimatorSettings
 from fourbar_ros.estimation.parameters import SETTINGS as ESTIMATOR
 from fourbar_ros.mechanism import assemble, LINK_NAMES, load_mechanism, Mechanism
@@ -166,9 +166,7 @@ ALLOWED: dict[str, dict[str, Allowed]] = {
         'link_a': (-1e6, 1e6, 'rad'), 'link_b': (-1e6, 1e6, 'rad'), 'branch': BRANCHES,
         'rate_a': (-100.0, 100.0, 'rad/s'), 'rate_b': (-100.0, 100.0, 'rad/s')},
     'plant': {
-        'rate': (1.0, 2000.0, 'Hz'), 'step': (1e-6, 0.1, 's'),
-        'command_timeout': (0.002, 10.0, 's'), 'sensor_timeout': (0.002, 10.0, 's'),
-        'timeout_action': TIMEOUT_ACTIONS},
+        'step': (1e-6, 0.1, 's'), **_allowed(settings_of(SupervisorSettings))},
     'estimator': _allowed(ESTIMATOR),
     'controller': _allowed(CONTROLLER),
 }

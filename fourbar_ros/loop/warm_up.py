@@ -8,7 +8,8 @@ from __future__ import annotations
 import sys
 
 from fourbar_ros.control import Controller, ControllerSettings
-from fourbar_ros.device import DeviceSupervisor, SimulatedTable, SupervisorSettings
+from fourbar_ros.device import DeviceSupervisor, SupervisorSettings
+from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.estimation import Estimator, EstimatorSettings
 from fourbar_ros.kernels.compiler import announced
 from fourbar_ros.loop.closed_loop import ClosedLoop

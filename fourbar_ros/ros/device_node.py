@@ -6,6 +6,7 @@
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.monotonic_clock import monotonic_ns
 from fourbar_ros.common.named_values import RejectedError
+from fourbar_ros.common.settings import settings_of
 from fourbar_ros.device import ClockModeError, DeviceSupervisor, SupervisorSettings
 from fourbar_ros.device.arming import DeviceState
 from fourbar_ros.ros.device_topics import DeviceTopics, LEVELS
@@ -44,8 +45,8 @@ class DeviceNode(Node):
         period_ns = round(1e9 / values['rate'])
         self._testbed = DeviceSupervisor(
             make_device(values, period_ns, lambda time_ns: self._pace.now_ns(time_ns)),
-            SupervisorSettings(values['command_timeout'], values['sensor_timeout'],
-                            values['timeout_action']))
+            SupervisorSettings(**{row.name: values[row.name]
+                                  for row in settings_of(SupervisorSettings)}))
         device = self._testbed.device
         self._log, self._errors, self._rejected = RareLog(self), RareLog(self), Recently()
         self._topics = DeviceTopics(self, self._testbed, values['mechanism'])

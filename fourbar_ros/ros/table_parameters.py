@@ -6,7 +6,7 @@
 from math import pi
 
 from fourbar_ros.common.settings import Setting
-from fourbar_ros.device import SimulatedTable
+from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, load_mechanism, SENSOR_NAMES
 from fourbar_ros.mechanism.closure import BRANCHES
 from fourbar_ros.plant import InitialState, load_table, Plant

@@ -18,7 +18,8 @@ from typing import Any
 from fourbar_ros.common.checks import at_least, at_most
 from fourbar_ros.common.monotonic_clock import monotonic_ns
 from fourbar_ros.common.progress import Progress
-from fourbar_ros.device import Device, DeviceState, Drive, SimulatedTable
+from fourbar_ros.device import Device, DeviceState, Drive
+from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.hardware.can_port import Port
 from fourbar_ros.hardware.dbc_codec import DbcCodec
 from fourbar_ros.hardware.emulator import ClockSettings, Emulator

@@ -15,13 +15,13 @@ from fourbar_ros.device import (
     DeviceState,
     DeviceSupervisor,
     Drive,
+    LinkSample,
     Samples,
     SupervisorSettings,
     Timing,
     WheelSample,
 )
 from fourbar_ros.mechanism import LINK_NAMES, load_mechanism, Mechanism
-from fourbar_ros.plant import SensorReading
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -110,7 +110,7 @@ class Bench(Device):
             raise FourbarError('the bus is off')
         self.speeds = self.speeds + torques / self.mechanism.flywheel_inertias * 4e-3
         names = tuple(LINK_NAMES[link] for link in self.links)
-        sample = SensorReading(stamp_ns, names, np.zeros(len(names)), np.empty(0))
+        sample = LinkSample(stamp_ns, names, np.zeros(len(names)), np.empty(0))
         return Samples(stamp_ns, (sample,), WheelSample(np.zeros(4), self.speeds, torques),
                        complete=self.complete)
 

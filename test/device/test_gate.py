@@ -71,7 +71,7 @@ def test_new_gate_is_disarmed() -> None:
     assert not ArmingGate().armed
 
 
-@pytest.mark.parametrize(('state', 'obstacles', 'needles'), [
+@pytest.mark.parametrize(('state', 'arming_blockers', 'needles'), [
     (DISARMED, ['no sample from link_c', 'two publishers'],
      ['no sample from link_c', 'two publishers']),
     (STOPPED, [], ['emergency_stop', 'old reason', 'reset_emergency_stop']),

@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from fourbar_ros.device import Drive, Samples, SimulatedTable
+from fourbar_ros.device import Drive, Samples
+from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, load_mechanism, Mechanism
 from fourbar_ros.plant import (
     Fault,
@@ -294,7 +295,7 @@ def test_prototype_with_everything_on_repeats_itself_to_the_byte() -> None:
 
 
 def test_wheels_are_named_as_in_the_topics(make: Make) -> None:
-    assert make().faults.targets[-4:] == FLYWHEEL_NAMES
+    assert make().injected_faults.targets[-4:] == FLYWHEEL_NAMES
 
 
 def test_what_is_broken_is_told_by_name(make: Make) -> None:

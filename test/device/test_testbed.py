@@ -17,9 +17,9 @@ from fourbar_ros.device import (
     DeviceSupervisor,
     Drive,
     Reaction,
-    SimulatedTable,
     SupervisorSettings,
 )
+from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.mechanism import angular_momentum, LINK_NAMES, Mechanism
 from fourbar_ros.plant import Fault, InitialState, Plant, PlantError, Table
 from fourbar_ros.plant.sensors import LinkSensorSettings

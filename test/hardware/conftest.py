@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from itertools import count
 
-from fourbar_ros.device import DeviceSupervisor, Samples, SimulatedTable, SupervisorSettings
+from fourbar_ros.device import DeviceSupervisor, Samples, SupervisorSettings
+from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.hardware.dbc_codec import DbcCodec
 from fourbar_ros.hardware.emulator import ClockSettings, Emulator
 from fourbar_ros.hardware.firmware import FirmwareSettings

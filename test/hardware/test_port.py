@@ -339,7 +339,7 @@ def test_without_python_can_it_is_told_what_to_install(monkeypatch):
 
 
 def test_python_can_is_not_imported_before_it_is_needed():
-    code = ('import sys; from fourbar_ros.hardware import dbc_codec, port; '
+    code = ('import sys; from fourbar_ros.hardware import can_port, dbc_codec; '
             'sys.exit(bool({"can", "cantools"} & set(sys.modules)))')
     assert subprocess.run([sys.executable, '-c', code], timeout=60).returncode == 0
 

@@ -87,7 +87,7 @@ def test_link_in_trouble_ends_it(driven, trouble, state, within, word) -> None:
 def test_wheels_that_are_parked_under_power_are_watched_too(make_world, trouble, state) -> None:
     # Before the links coast by themselves.
     world = make_world(settings=SupervisorSettings(
-        command_timeout_s=0.05, timeout_action='hold_speed'))
+        command_timeout=0.05, timeout_action='hold_speed'))
     world.run(1.0)
     world.torque(*TORQUE)
     assert world.arm() == (True, 'armed')

@@ -8,7 +8,8 @@ from math import pi
 
 from fourbar_ros.control import Controller, ControllerSettings
 from fourbar_ros.control.actuation_cost import FLYWHEEL_ENERGY
-from fourbar_ros.device import DeviceState, DeviceSupervisor, SimulatedTable, SupervisorSettings
+from fourbar_ros.device import DeviceState, DeviceSupervisor, SupervisorSettings
+from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.estimation import Estimator, EstimatorSettings
 from fourbar_ros.loop import ClosedLoop, Step
 from fourbar_ros.mechanism import angular_momentum, branch_of, load_mechanism, Mechanism

@@ -7,6 +7,7 @@ from dataclasses import replace
 from math import pi
 
 from fourbar_ros.control import WheelCommand
+from fourbar_ros.device import LinkSample
 from fourbar_ros.loop import (
     ClosedLoop,
     load_scenario,
@@ -18,7 +19,6 @@ from fourbar_ros.loop import (
     ScriptedSetpoint,
     Step,
 )
-from fourbar_ros.plant import SensorReading
 import numpy as np
 import pytest
 
@@ -156,7 +156,7 @@ def test_recording_is_what_the_steps_hold() -> None:
         found['estimate/innovation.tick_ns'], found['flywheel_states.stamp_ns'][1:])
 
 
-def thinned(step: Step, samples: tuple[SensorReading, ...]) -> Step:
+def thinned(step: Step, samples: tuple[LinkSample, ...]) -> Step:
     """Give a step other samples of the links."""
     return replace(step, samples=replace(step.samples, links=samples))
 
@@ -166,9 +166,9 @@ def test_what_was_not_there_stays_empty() -> None:
     scenario = replace(load_scenario('paper'), duration=0.012)
     steps = list(run_scenario(scenario))
     first_ns = steps[0].samples.stamp_ns
-    partial = SensorReading(
+    partial = LinkSample(
         first_ns + 3_000_000, ('link_b', 'link_d'), np.array([1.0, 3.0]), np.empty(0))
-    newer = SensorReading(first_ns + 5_000_000, ('link_b',), np.array([1.5]), np.empty(0))
+    newer = LinkSample(first_ns + 5_000_000, ('link_b',), np.array([1.5]), np.empty(0))
     recording = Recording()
     recording.add(replace(thinned(steps[0], ()), estimate=None, control=None))
     recording.add(thinned(steps[1], (partial,)))

@@ -11,9 +11,9 @@ from typing import Any
 
 from fourbar_ros.analysis.calibration.excitation import Excitation
 from fourbar_ros.analysis.calibration.signals import link_signal, LinkSignal, WheelSignal
-from fourbar_ros.device import SimulatedTable
 from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.device.interface import no_torque
+from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.mechanism import LINK_NAMES, load_mechanism, Mechanism
 from fourbar_ros.plant import InitialState, load_table, Plant, Table
 import numpy as np
