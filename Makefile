@@ -3,11 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 ARGS ?=
 
-# A sourced ROS, or a Python of somebody's own, must not leak into the environment.
+# The environment of a sourced ROS or of another Python must not reach .venv.
 unexport PYTHONPATH PYTHONHOME LD_LIBRARY_PATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH
 unexport RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-# What is installed. The folders are listed too, because a removed file changes its folder.
+# Sources of the installation. Folders are listed too: a removed file changes its folder.
 FOLDERS := $(shell find $(wildcard fourbar_ros config launch scripts resource) \
   -type d ! -name __pycache__)
 SOURCES := package.xml $(FOLDERS) \
@@ -15,16 +15,18 @@ SOURCES := package.xml $(FOLDERS) \
 RECIPE := setup.py setup.cfg $(wildcard pyproject.toml)
 PIP_INSTALL := $(VENV)/bin/python -m pip install --disable-pip-version-check --quiet
 CLEAR_BUILD := rm -rf build *.egg-info
-# Carries the time when the last complete install began; without it .venv is built anew.
+# Its time is the start of the last complete installation; without it .venv is built anew.
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help install demo bench test lint clean
+.PHONY: help install demo bench test test-quick test-long lint clean
 
 help:
 	@echo 'make install   build .venv and install the package into it'
 	@echo 'make demo      run the simulated testbed, closed loop'
+	@echo 'make test      run all tests but the slow ones (ARGS="-k closure" for a selection)'
+	@echo 'make test-quick  run the tests that start no process'
+	@echo 'make test-long   run the slow tests: campaigns, studies, long runs'
 	@echo 'make bench     time the mechanics beside MuJoCo, numbers in bench.json'
-	@echo 'make test      run all tests           (ARGS="-k closure" for some of them)'
 	@echo 'make lint      check style and types'
 	@echo 'make clean     remove .venv and everything else that was built'
 
@@ -36,21 +38,19 @@ demo: $(INSTALLED)
 bench: $(INSTALLED)
 	@$(VENV)/bin/fourbar bench --json bench.json $(ARGS)
 
-# Those that start processes come one after the other, and wait for each other most of the time. The
-# rest compute in the meantime, with what is left of the machine, one thread each, and are told of
-# afterwards.
-ALONE := node or package
-LEISURELY := $(shell command -v chrt >/dev/null && echo chrt --idle 0 || echo nice -n 19)
+# Tests that start processes run one after the other in one worker; the other worker computes
+# meanwhile (test/conftest.py). One thread each, since there are as many workers as cores.
+PYTEST := OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest
+WORKERS := -q -n auto --dist loadgroup
+
 test: $(INSTALLED)
-ifeq ($(ARGS),)
-	@OPENBLAS_NUM_THREADS=1 $(LEISURELY) $(VENV)/bin/pytest -m 'not ($(ALONE))' -n auto --dist loadfile \
-	  > $(VENV)/rest.log 2>&1 & rest=$$!; trap 'kill $$rest' INT TERM; \
-	$(VENV)/bin/pytest -m '$(ALONE)'; alone=$$?; \
-	wait $$rest; others=$$?; cat $(VENV)/rest.log; \
-	exit $$(( alone ? alone : others ))
-else
-	@$(VENV)/bin/pytest $(ARGS)
-endif
+	@$(PYTEST) $(if $(ARGS),$(ARGS),$(WORKERS) -m 'not slow')
+
+test-quick: $(INSTALLED)
+	@$(PYTEST) $(WORKERS) -m 'not (slow or node or package)' $(ARGS)
+
+test-long: $(INSTALLED)
+	@$(PYTEST) $(WORKERS) -m slow $(ARGS)
 
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .

@@ -58,9 +58,8 @@ setup(
     version=VERSION,
     description='Simulate, estimate, control and drive a free-floating four-bar linkage '
                 'with flywheels',
-    url='https://fourbar-ros.example.org',
-    maintainer='The fourbar_ros authors',
-    maintainer_email='maintainers@fourbar-ros.example.org',
+    maintainer='fourbar_ros maintainers',
+    maintainer_email='maintainers@fourbar-ros.invalid',
     license='Apache-2.0',
     python_requires='>=3.10',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),

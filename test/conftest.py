@@ -5,6 +5,8 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from itertools import count
+import os
 from typing import Any
 
 from fourbar_ros.common.errors import FourbarError
@@ -16,9 +18,42 @@ import pytest
 
 Array = NDArray[np.float64]
 
-# How long an example takes is no law of nature: other tests run on the same machine.
+# The duration of an example is not a test: other tests run on the same machine.
 settings.register_profile('patient', deadline=None)
 settings.load_profile('patient')
+
+PASSED_PER_DOT = 100
+"""Passed tests per dot of a run with workers: ten thousand dots hide what matters."""
+_passed = count(1)
+NICE = 10
+"""Niceness of computing tests: a tenth of a processor that a node wants as well."""
+
+
+def starts_processes(item: pytest.Item) -> bool:
+    """Tell whether a test starts nodes or builds the package."""
+    return any(item.get_closest_marker(name) for name in ('node', 'package'))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give one worker all tests that start processes, first, and keep others together by file."""
+    items.sort(key=starts_processes, reverse=True)
+    for item in items:
+        group = 'processes' if starts_processes(item) else str(item.path)
+        item.add_marker(pytest.mark.xdist_group(group))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Lower the priority of a worker that only computes below the real-time nodes of the other."""
+    if 'PYTEST_XDIST_WORKER' in os.environ and not starts_processes(item) and os.nice(0) == 0:
+        os.nice(NICE)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_report_teststatus(report: Any, config: pytest.Config) -> tuple[str, str, str] | None:
+    """Show one dot for many passed tests in a run with workers."""
+    if report.when == 'call' and report.passed and config.getoption('numprocesses', None):
+        return 'passed', '' if next(_passed) % PASSED_PER_DOT else '.', 'PASSED'
+    return None
 
 
 @pytest.fixture(scope='session')

@@ -67,7 +67,7 @@ def test_colcon_test_runs_tests_that_pass(workspace, check):
     results = workspace / 'build' / 'fourbar_ros' / 'pytest.xml'
     # A quick part: all others ran against the installed package already.
     check(*COLCON, 'test', '--return-code-on-test-failure', '--pytest-args',
-          '-m', 'not package and not node', 'test/test_configuration.py',
+          '-m', 'not package and not node', 'test/common/test_config_files.py',
           cwd=workspace, PATH=PATH)
     suite = ElementTree.parse(results).getroot().find('testsuite')
     assert int(suite.get('tests')) > 10
