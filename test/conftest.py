@@ -97,9 +97,10 @@ def momentum_and_energy() -> Callable[[Mechanism, Array, Array, Array], tuple[fl
 
 
 @contextmanager
-def _refused(kind: type[FourbarError], **values: Any) -> Iterator[None]:
+def _refused(kind: type[FourbarError], **values: Any
+             ) -> Iterator[pytest.ExceptionInfo[FourbarError]]:
     with pytest.raises(kind) as caught:
-        yield
+        yield caught
     found = {name: caught.value.values.get(name) for name in values}
     assert found == values, caught.value
     # One line, as commands print it and nodes log it.
@@ -107,7 +108,7 @@ def _refused(kind: type[FourbarError], **values: Any) -> Iterator[None]:
 
 
 @pytest.fixture(scope='session')
-def refuses() -> Callable[..., AbstractContextManager[None]]:
+def refuses() -> Callable[..., AbstractContextManager[pytest.ExceptionInfo[FourbarError]]]:
     """
     Return a context that expects an error of a type, with these of its values.
 

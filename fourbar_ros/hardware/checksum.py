@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The checksum of the prototype's frames: CRC-8 of SAE J1850 over identifier and data.
+Checksum of the prototype's frames: CRC-8 of SAE J1850 over identifier and data.
 
-Polynomial 0x1D, starting with 0xFF, and inverted. With the identifier in it, a frame under a wrong
-one is not taken for another message.
+Polynomial 0x1D, initial value 0xFF, inverted. The identifier is part of it, so that a frame with a
+corrupted identifier is not accepted as another message.
 """
 
 from __future__ import annotations
 
-_POLYNOMIAL, _START, _FINAL = 0x1D, 0xFF, 0xFF
+_POLYNOMIAL, _INITIAL, _FINAL_XOR = 0x1D, 0xFF, 0xFF
 
 
 def _remainder(byte: int) -> int:
@@ -22,28 +22,14 @@ def _remainder(byte: int) -> int:
 _TABLE = tuple(map(_remainder, range(256)))
 
 
-def begun(frame_id: int) -> int:
-    """Return the register after the identifier, which counts as two bytes, the high one first."""
-    return _TABLE[_TABLE[_START ^ frame_id >> 8] ^ frame_id & 0xFF]
-
-
-def finished(register: int, data: bytes) -> int:
-    """
-    Return the checksum.
-
-    :param register: of `begun`.
-    :param data: what follows the identifier.
-    """
-    for byte in data:
-        register = _TABLE[register ^ byte]
-    return register ^ _FINAL
-
-
 def checksum(frame_id: int, data: bytes) -> int:
     """
     Return the checksum of a frame.
 
-    :param frame_id: 11 bits.
+    :param frame_id: 11 bits; it counts as two bytes, the high one first.
     :param data: the bytes before the checksum.
     """
-    return finished(begun(frame_id), data)
+    register = _TABLE[_TABLE[_INITIAL ^ frame_id >> 8] ^ frame_id & 0xFF]
+    for byte in data:
+        register = _TABLE[register ^ byte]
+    return register ^ _FINAL_XOR

@@ -246,7 +246,7 @@ class Emulator:
         torque = float(self._torques[link]) / max(self._steps, 1)
         measured_us = self._link_us(link, samples.stamp_ns - self._shift_ns)
         self._say(MotorReport(
-            link, torque, firmware.sequence, firmware.state, counter), frames)
+            link, torque, firmware.state, counter, True, firmware.sequence), frames)
         self._say(WheelReport(
             link, counter, float(samples.wheels.angles[link]) % TURN, TURN,
             measured_us % WRAP_US, WRAP_US, float(samples.wheels.speeds[link])), frames)

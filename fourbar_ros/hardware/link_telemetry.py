@@ -37,7 +37,6 @@ class LinkTelemetry:
     """
     One link: its wheel, its angle sensor, its clock, its health; times are the host's [ns].
 
-    :param has_clock: whether it tells its time; if not, what it says is of when it arrives.
     :ivar counts: of frames that were lost or not taken, by why.
     :ivar wheel_angle: of the last answer, unwrapped [rad].
     :ivar wheel_speed: mean between the last two answers [rad/s].
@@ -51,7 +50,7 @@ class LinkTelemetry:
     :ivar twins: how many others answer in its place.
     """
 
-    def __init__(self, has_clock: bool) -> None:
+    def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self.clock = LinkClock()
         self.wheel_angle = 0.0
@@ -66,8 +65,6 @@ class LinkTelemetry:
         self.angles: deque[tuple[int, float, float | None]] = deque(maxlen=1000)
         self.boots = 0
         self.twins = 0
-        self.answers: int | None = None
-        self._has_clock = has_clock
         self._answered: int | None = None
         self._motor_answered = False
         self._angle_sequence: int | None = None
@@ -137,7 +134,7 @@ class LinkTelemetry:
             self.counts['replayed'] += 1
             return
         self._motor_answered = True
-        self.torque, self.answers = report.torque, report.answers
+        self.torque = report.torque
         if report.state is not None:
             self.state = report.state
 
@@ -209,7 +206,7 @@ class LinkTelemetry:
         return False
 
     def _measured_ns(self, time_us: int | None, wrap_us: int, arrival_ns: int) -> int | None:
-        if time_us is None or not self._has_clock or not self.clock.settled:
+        if time_us is None or not self.clock.settled:
             return None
         return self.clock.host_ns(self.clock.unwrapped(time_us, wrap_us, arrival_ns))
 

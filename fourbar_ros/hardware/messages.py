@@ -2,70 +2,99 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What host and links tell each other, whatever the messages on the bus look like.
+Messages between host and links, independent of their layout on the bus.
 
-A codec turns this into frames and back. Links are numbered 0 to 3, for a to d. Link times are
-those of the link's own clock, in whole microseconds; they and wheel angles start over after so
-many, which is given with them.
+A codec converts them to frames and back. Links are numbered 0 to 3, for a to d. Link times are
+readings of the link's own clock in whole microseconds. Link times and wheel angles wrap; a report
+carries the period.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
-from typing import NamedTuple, Protocol
+from enum import IntEnum
+from typing import Any, NamedTuple, Protocol
 
 from fourbar_ros.common.errors import FourbarError
 
 
 class BusError(FourbarError):
-    """A bus that is not there, cannot be used, or has gone away."""
+    """A bus that cannot be opened or used."""
 
 
 class FrameError(FourbarError):
     """
-    A frame that is not taken.
+    A frame that is rejected, or a message that cannot be encoded.
 
-    :ivar kind: `length`, `checksum` or `value`, to be counted by.
+    :ivar kind: `length`, `checksum` or `value`; also the key of the counter of such frames.
     """
 
-    def __init__(self, kind: str, message: str) -> None:
-        super().__init__(message)
+    def __init__(self, kind: str, message: str, /, **values: Any) -> None:
+        super().__init__(message, **values)
         self.kind = kind
 
 
 class Frame(NamedTuple):
-    """One CAN frame; a remote frame asks for data and carries none."""
+    """One CAN frame; a remote frame requests data and carries none."""
 
     frame_id: int
     data: bytes = b''
     remote: bool = False
 
 
-class LinkState(Enum):
-    """What the electronics of a link do."""
+class Bus(Protocol):
+    """A bus that sends and receives frames; times are of the host's monotonic clock [ns]."""
+
+    @property
+    def fault(self) -> str | None:
+        """Fault of the bus itself, as far as its driver reports one."""
+
+    def send(self, frame: Frame) -> None:
+        """
+        Send a frame.
+
+        :raises BusError: the bus cannot be used.
+        """
+
+    def receive(self, timeout_s: float) -> tuple[Frame, int] | None:
+        """
+        Wait for a frame.
+
+        :returns: the frame and its time of arrival [ns], None at the timeout.
+        :raises BusError: the bus cannot be used.
+        """
+
+    def diagnostic_values(self) -> dict[str, object]:
+        """Return counters and states for diagnostics, by name."""
+
+    def close(self) -> None:
+        """Close the bus."""
+
+
+class LinkState(IntEnum):
+    """State of the electronics of a link."""
 
     IDLE = 0
     ARMED = 1
     COASTING = 2
-    """No command came for too long: no torque until it is disarmed, and armed again."""
+    """Command timeout: no torque until the link is disarmed and armed again."""
     STOPPED = 3
-    """By the emergency stop: no torque until that is released."""
+    """Emergency stop: no torque until it is released."""
     FAULT = 4
-    """By itself: no torque until the cause has gone, and it is disarmed and armed again."""
+    """Own fault: no torque until the cause is gone and the link is disarmed and armed again."""
 
 
 COUNTERS, SEQUENCES = 256, 16
-"""Counters of a `Sync`, sequences of commands and numbers of starts begin again after so many;
-sequences of samples and heartbeats after fewer."""
+"""Number of values of 8-bit counters (`Sync`, commands, boots) and of 4-bit sequence numbers
+(angle samples, heartbeats)."""
 
 LINK_FAULTS = ('driver', 'encoder', 'angle_sensor', 'overspeed', 'overtemperature',
                'undervoltage', 'no_limits')
-"""What may be wrong with a link, in the order of the bits; `no_limits`: none were loaded."""
+"""Faults of a link, in the order of the bits; `no_limits`: no limits are loaded."""
 
 
-# From the host to a link.
+# From the host to one link.
 
 @dataclass(frozen=True)
 class Command:
@@ -73,9 +102,9 @@ class Command:
     Drive a wheel.
 
     :param value: torque [N m], or speed relative to the link [rad/s].
-    :param by_speed: which of both.
-    :param enable: whether the wheel has power; without it the link is disarmed.
-    :param sequence: 0 to 255, one more with every command to this link.
+    :param by_speed: whether the value is a speed.
+    :param enable: whether the motor has power; False disarms the link.
+    :param sequence: 0 to 255, incremented with every command to this link.
     """
 
     link: int
@@ -88,7 +117,7 @@ class Command:
 @dataclass(frozen=True)
 class Limits:
     """
-    What a link must not exceed, whatever it is told.
+    Limits that the link enforces itself.
 
     :param torque: [N m].
     :param speed: of the wheel relative to the link [rad/s].
@@ -103,19 +132,19 @@ class Limits:
 
 @dataclass(frozen=True)
 class Sync:
-    """Measure now, and answer with this counter (0 to 255)."""
+    """Request to measure now and to answer with this counter (0 to 255)."""
 
     counter: int
 
 
 @dataclass(frozen=True)
 class Stop:
-    """Cut the power of all wheels, until a `Release`."""
+    """Emergency stop: no power on any wheel until `Release`."""
 
 
 @dataclass(frozen=True)
 class Release:
-    """End the emergency stop; the links are idle."""
+    """End of the emergency stop; the links become idle."""
 
 
 # From a link to the host.
@@ -123,13 +152,13 @@ class Release:
 @dataclass(frozen=True)
 class WheelReport:
     """
-    The wheel encoder when a `Sync` came, or as near to it as the link has it.
+    Reading of the wheel encoder at a `Sync`, or as close to it as the link can measure.
 
-    :param counter: of the `Sync`; None from electronics that do not know it.
+    :param counter: of the `Sync`; None from electronics that do not repeat it.
     :param angle: relative to the link [rad], modulo `turn`.
-    :param time_us: link time of the measurement modulo `wrap_us`; None from electronics that have
-        no clock.
-    :param speed: relative to the link, where the electronics measure it [rad/s].
+    :param time_us: link time of the measurement modulo `wrap_us`; None from electronics without a
+        clock.
+    :param speed: relative to the link [rad/s], None where the electronics do not measure it.
     """
 
     link: int
@@ -144,20 +173,21 @@ class WheelReport:
 @dataclass(frozen=True)
 class MotorReport:
     """
-    What the motor did since the last `Sync`.
+    Motor torque since the last `Sync`.
 
-    :param torque: really applied to the wheel, mean [N m].
-    :param answers: sequence of the last command that was obeyed; None from electronics that do not
-        know it.
-    :param state: of the link; None where only the heartbeat tells.
-    :param counter: of the `Sync`; None from electronics that do not know it.
+    :param torque: mean torque applied to the wheel [N m].
+    :param state: of the link; None where only the heartbeat reports it.
+    :param counter: of the `Sync`; None from electronics that do not repeat it.
+    :param answered: whether a command has arrived since the electronics started.
+    :param answers: sequence of the last command that was carried out, if `answered`.
     """
 
     link: int
     torque: float
-    answers: int | None
-    state: LinkState | None
+    state: LinkState | None = None
     counter: int | None = None
+    answered: bool = False
+    answers: int = 0
 
 
 @dataclass(frozen=True)
@@ -165,9 +195,9 @@ class AngleReport:
     """
     One sample of the link-angle sensor.
 
-    :param sequence: 0 to 15, one more with every sample.
+    :param sequence: 0 to 15, incremented with every sample.
     :param angle: orientation in frame `table`, in (-pi, pi] [rad].
-    :param rate: of the gyro [rad/s], None without one.
+    :param rate: of the gyro [rad/s], None without a gyro.
     :param time_us: link time of the measurement modulo `wrap_us`.
     """
 
@@ -182,11 +212,11 @@ class AngleReport:
 @dataclass(frozen=True)
 class ClockReport:
     """
-    When a `Sync` came, sent at once.
+    Link time at which a `Sync` arrived, sent immediately.
 
     :param counter: of the `Sync`.
     :param time_us: link time modulo 2**32.
-    :param boot: another number after each start of the electronics (0 to 255).
+    :param boot: number of this start of the electronics (0 to 255); it changes with every start.
     """
 
     link: int
@@ -198,13 +228,13 @@ class ClockReport:
 @dataclass(frozen=True)
 class Heartbeat:
     """
-    How a link is.
+    Health of a link.
 
-    :param sequence: 0 to 15, one more with every heartbeat; None where electronics have none.
+    :param sequence: 0 to 15, incremented with every heartbeat; None from electronics without one.
     :param faults: of `LINK_FAULTS`.
-    :param voltage: of the supply [V], None if it is not told.
-    :param temperature: of the motor or its driver [deg C], None if it is not told.
-    :param boot: as of `ClockReport`, None if it is not told.
+    :param voltage: of the supply [V], None if it is not reported.
+    :param temperature: of the motor or its driver [deg C], None if it is not reported.
+    :param boot: as in `ClockReport`, None if it is not reported.
     """
 
     link: int
@@ -221,45 +251,34 @@ ToHost = WheelReport | MotorReport | AngleReport | ClockReport | Heartbeat
 
 
 class Codec(Protocol):
-    """
-    One language on the bus, understood from both ends.
-
-    :cvar name: of it.
-    :cvar has_angles: whether links tell their angles in it.
-    :cvar has_clock: whether links tell their time, by `ClockReport` and in reports.
-    """
-
-    name: str
-    has_angles: bool
-    has_clock: bool
+    """A protocol on the bus: conversion between messages and frames, for both ends."""
 
     def to_links(self, message: ToLinks) -> Sequence[Frame]:
         """
-        Write what the host says; nothing where the language has no word for it.
+        Encode a message of the host; no frames if the protocol has no such message.
 
-        :raises FrameError: kind `value`: a number that is not finite or does not fit.
+        :raises FrameError: kind `value`: a number is not finite or does not fit.
         """
 
     def to_host(self, message: ToHost) -> Sequence[Frame]:
         """
-        Write what a link says, as :meth:`to_links`.
+        Encode a message of a link, as :meth:`to_links`.
 
-        :raises FrameError: likewise.
+        :raises FrameError: kind `value`, as :meth:`to_links`.
         """
 
     def from_links(self, frame: Frame) -> ToHost | None:
         """
-        Read at the host what a link says.
+        Decode at the host a message of a link.
 
-        :returns: the message; None for a frame that is none of a link's.
-        :raises FrameError: it is a link's, but of a wrong length, corrupted, or says what cannot
-            be.
+        :returns: the message; None for a frame that no link sends.
+        :raises FrameError: wrong length, wrong checksum, or an invalid value.
         """
 
     def from_host(self, frame: Frame) -> ToLinks | None:
         """
-        Read at the links what the host says.
+        Decode at a link a message of the host.
 
-        :returns: the message; None for a frame that is none of the host's.
-        :raises FrameError: likewise.
+        :returns: the message; None for a frame that the host does not send.
+        :raises FrameError: as :meth:`from_links`.
         """

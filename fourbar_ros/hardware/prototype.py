@@ -121,7 +121,7 @@ class Prototype(Device):
         self.mechanism = mechanism
         self.period_ns = period_ns
         self.measures_rates = gyro
-        self.links = [LinkTelemetry(codec.has_clock) for _ in LINKS]
+        self.links = [LinkTelemetry() for _ in LINKS]
         self._codec = codec
         self._open_bus = open_bus
         self._bus: Bus | None = open_bus()

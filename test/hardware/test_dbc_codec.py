@@ -8,7 +8,9 @@ from dataclasses import replace
 from math import inf, nan, pi
 import re
 
+import cantools.database
 from fourbar_ros.common.config_files import ConfigurationError, share_directory
+from fourbar_ros.hardware.checksum import checksum
 from fourbar_ros.hardware.dbc import DbcError
 from fourbar_ros.hardware.dbc_codec import DbcCodec
 from fourbar_ros.hardware.messages import (
@@ -37,6 +39,7 @@ repeatable = settings(deadline=None, derandomize=True)
 
 CODEC = DbcCodec('prototype')
 FILE = share_directory() / 'config' / 'prototype.dbc'
+DATABASE = cantools.database.load_file(FILE)
 TURN, WRAP_US = 256 * 2 * pi, 10 * 2 ** 20
 # Half a count of angles, and of single precision.
 HALF_COUNT, SINGLE = pi / 65536, 2.0 ** -24
@@ -49,7 +52,7 @@ times = st.integers(0, WRAP_US - 1)
 COMMAND = Command(1, 0.01, True, True, 7)
 LIMITS = Limits(2, 0.05, 300.0)
 WHEEL = WheelReport(3, 5, 1.25, TURN, 1000, WRAP_US)
-MOTOR = MotorReport(0, 0.02, 8, LinkState.ARMED, 77)
+MOTOR = MotorReport(0, 0.02, LinkState.ARMED, 77, True, 8)
 ANGLE = AngleReport(0, 3, -1.0, 0.5, 50, WRAP_US)
 CLOCK = ClockReport(1, 3, 4_000_000_000, 2)
 HEARTBEAT = Heartbeat(2, 3, LinkState.FAULT, frozenset({'driver', 'no_limits'}), 12.0, 25.0, 1)
@@ -120,9 +123,9 @@ def test_wheel(link, counter, angle, time_us):
 
 
 @repeatable
-@given(links, torques, st.none() | bytes_, st.sampled_from(LinkState))
-def test_motor(link, torque, answers, state):
-    report = MotorReport(link, torque, answers, state, 200 + link)
+@given(links, torques, st.booleans(), bytes_, st.sampled_from(LinkState))
+def test_motor(link, torque, answered, answers, state):
+    report = MotorReport(link, torque, state, 200 + link, answered, answers)
     back = read(written(report))
     assert back.torque == pytest.approx(torque, rel=SINGLE, abs=1e-45)
     assert replace(back, torque=torque) == report
@@ -196,9 +199,10 @@ def test_under_another_identifier_it_is_not_taken(message):
 def test_wrong_length(message):
     frame = written(message)
     for length in set(range(9)) - {len(frame.data)}:
-        with pytest.raises(FrameError, match=f'bytes, got {length}') as caught:
+        with pytest.raises(FrameError) as caught:
             read(frame._replace(data=frame.data.ljust(8, b'\0')[:length]))
         assert caught.value.kind == 'length'
+        assert caught.value.values['value'] == length
 
 
 def test_foreign_frames_are_nobodys():
@@ -230,7 +234,7 @@ def test_foreign_frames_are_nobodys():
 def test_what_does_not_fit_is_not_written(message):
     with pytest.raises(FrameError) as caught:
         written(message)
-    assert caught.value.kind == 'value'
+    assert caught.value.kind == 'value' and 'limit' in caught.value.values
     assert '\n' not in str(caught.value)
 
 
@@ -241,14 +245,16 @@ def test_what_does_not_fit_is_not_written(message):
     (MOTOR, 'STATE', 5), (HEARTBEAT, 'STATE', 15), (HEARTBEAT, 'FAULTS', 0x800),
     (Stop(), 'CODE', 0x3C), (Release(), 'CODE', 0),
 ], ids=named)
-def test_what_cannot_be_is_not_read(message, signal, count):
+def test_invalid_count_is_not_read(message, signal, count):
     """Though its checksum is right."""
     frame = written(message)
-    word = (CODEC._of_host | CODEC._of_links)[frame.frame_id]
-    counts = {**word.layout.counts(frame), signal: count}
-    with pytest.raises(FrameError, match=signal) as caught:
-        read(word.layout.frame(counts))
+    layout = DATABASE.get_message_by_frame_id(frame.frame_id)
+    counts = layout.decode_simple(frame.data, decode_choices=False, scaling=False)
+    data = layout.encode({**counts, signal: count}, scaling=False, strict=False)[:-1]
+    with pytest.raises(FrameError) as caught:
+        read(Frame(frame.frame_id, data + bytes((checksum(frame.frame_id, data),))))
     assert caught.value.kind == 'value'
+    assert caught.value.values['name'] == f'{layout.name}.{signal}'
 
 
 def test_half_a_turn_is_told_to_one_side():
@@ -296,45 +302,50 @@ def test_signals_of_the_lab_are_no_trouble(changed):
     assert codec.from_links(*codec.to_host(MOTOR)).state is MOTOR.state
 
 
-@pytest.mark.parametrize('pattern, replacement, told', [
-    (r'LINK_C_WHEEL', 'LINK_C_ROUND', 'no message LINK_C_WHEEL'),
-    (r'\bRATE\b', 'SPIN', 'LINK_A_ANGLE: no signal RATE'),
+@pytest.mark.parametrize('pattern, replacement, values', [
+    (r'LINK_C_WHEEL', 'LINK_C_ROUND', {'message': 'LINK_C_WHEEL'}),
+    (r'\bRATE\b', 'SPIN', {'message': 'LINK_A_ANGLE', 'signal': 'RATE'}),
     (r'^ SG_ CHECKSUM : 56.*$', ' SG_ SUM : 56|8@1+ (1,0) [0|0] "" HOST',
-     'LINK_A_COMMAND: no signal CHECKSUM'),
-    (r'CHECKSUM : 8\|8', 'CHECKSUM : 8|7', 'SYNC: CHECKSUM is too narrow: it has 7 bits, 8'),
+     {'message': 'LINK_A_COMMAND', 'signal': 'CHECKSUM'}),
+    (r'CHECKSUM : 8\|8', 'CHECKSUM : 8|7',
+     {'message': 'SYNC', 'signal': 'CHECKSUM', 'value': 7, 'limit': 8}),
+    (r'(LINK_A_COMMAND: [^B]*CHECKSUM : )56', r'\g<1>48',
+     {'message': 'LINK_A_COMMAND', 'signal': 'CHECKSUM'}),
     (r'SEQUENCE : 52\|4', 'SEQUENCE : 52|3',
-     'LINK_A_ANGLE: SEQUENCE is too narrow: it has 3 bits, 4'),
+     {'message': 'LINK_A_ANGLE', 'signal': 'SEQUENCE', 'value': 3, 'limit': 4}),
     (r'SEQUENCE : 40\|8@1\+', 'SEQUENCE : 40|8@1-',
-     'SEQUENCE must be an unsigned integer without a scale'),
+     {'message': 'LINK_A_COMMAND', 'signal': 'SEQUENCE'}),
     (r'ANGLE : 0\|16@1- \(9.5', 'ANGLE : 0|15@1- (9.5',
-     r'LINK_A_ANGLE: ANGLE is too narrow: it goes from -1.5\d+ to 1.5\d+, -3.14159 to 3.14159'),
-    (r'TIME : 24\|20@1\+ ', 'TIME : 24|17@1+ ', 'LINK_A_WHEEL: TIME is too narrow'),
-    (r'TIME : 0\|32@1\+ \(1,', 'TIME : 0|32@1+ (2,', r'CLOCK: TIME must start over at 2\^32 us'),
-    (r'SPEED : 32\|16@1\+ \(0.1,', 'SPEED : 32|16@1+ (-0.1,', 'factor must be positive'),
-    (r'\b257\b', '258',
-     'LINK_B_COMMAND and LINK_C_COMMAND have the same identifier 0x102'),
-    (r'^BO_ 272 ', 'BO_ 2147483920 ', 'LINK_A_WHEEL: it must be a classic frame with an 11-bit'),
-    (r'^ SG_ MODE : 32\|1', ' SG_ MODE : 31|1', 'is no DBC file that can be used: .*overlapping'),
-    (r'^ SG_ CHECKSUM : 56\|8', ' SG_ CHECKSUM : 56|9',
-     'no DBC file that can be used: .*does not fit'),
-    (r'^BU_:', 'BU_ ', 'is no DBC file that can be used'),
+     {'message': 'LINK_A_ANGLE', 'signal': 'ANGLE', 'limit': (-pi, pi),
+      'value': pytest.approx((-pi / 2, pi / 2), abs=1e-4)}),
+    (r'TIME : 24\|20@1\+ ', 'TIME : 24|17@1+ ',
+     {'message': 'LINK_A_WHEEL', 'signal': 'TIME', 'value': 10 * 2 ** 17, 'limit': (2e6, inf)}),
+    (r'TIME : 0\|32@1\+ \(1,', 'TIME : 0|32@1+ (2,',
+     {'message': 'LINK_A_CLOCK', 'signal': 'TIME', 'value': 2 ** 33, 'limit': (2 ** 32, 2 ** 32)}),
+    (r'SPEED : 32\|16@1\+ \(0.1,', 'SPEED : 32|16@1+ (-0.1,',
+     {'message': 'LINK_A_LIMITS', 'signal': 'SPEED', 'value': -0.1, 'limit': 0.0}),
+    (r'\b257\b', '258', {'message': 'LINK_B_COMMAND', 'value': 0x102}),
+    (r'^BO_ 272 ', 'BO_ 2147483920 ', {'message': 'LINK_A_WHEEL', 'value': 272, 'limit': 0x7FF}),
+    # Signals that overlap, or that reach beyond the message, and a line that is cut.
+    (r'^ SG_ MODE : 32\|1', ' SG_ MODE : 31|1', {}),
+    (r'^ SG_ CHECKSUM : 56\|8', ' SG_ CHECKSUM : 56|9', {}), (r'^BU_:', 'BU_ ', {}),
 ])
-def test_file_that_lacks_something_is_refused_in_one_line(changed, pattern, replacement, told):
-    with pytest.raises(DbcError, match=told) as caught:
+def test_file_that_lacks_something_is_refused_in_one_line(
+        changed, pattern, replacement, values, refuses, tmp_path):
+    path = str(tmp_path / 'lab.dbc')
+    with refuses(DbcError, file=path, **values) as caught:
         changed((pattern, replacement))
-    assert 'lab.dbc' in str(caught.value)
-    assert '\n' not in str(caught.value)
+    assert path in str(caught.value)
 
 
 @pytest.mark.parametrize('content', [
     b'', b'nonsense', b'\xff\xfe\x00', b'BO_ 1 A: 8 X\n SG_ S : 0|8@1+ (1,0', b'BO_ x y',
     b'VERSION ""\n', b'mechanism: {}\n'])
-def test_what_is_no_dbc_file_is_refused_in_one_line(tmp_path, content):
+def test_what_is_no_dbc_file_is_refused_in_one_line(tmp_path, content, refuses):
     path = tmp_path / 'bad.dbc'
     path.write_bytes(content)
-    with pytest.raises(DbcError, match=re.escape(str(path))) as caught:
+    with refuses(DbcError, file=str(path)):
         DbcCodec(str(path))
-    assert '\n' not in str(caught.value)
 
 
 def test_file_cut_anywhere_is_refused_or_read(tmp_path):
@@ -347,14 +358,14 @@ def test_file_cut_anywhere_is_refused_or_read(tmp_path):
             DbcCodec(str(path))
 
 
-@pytest.mark.parametrize('name, told', [
-    ('nothing', 'available are odrive, prototype'), ('./nothing.dbc', 'no such file')])
-def test_file_that_is_not_there(name, told):
-    with pytest.raises(ConfigurationError, match=told):
+@pytest.mark.parametrize('name, presets', [
+    ('nothing', ['odrive', 'prototype']), ('./nothing.dbc', None)])
+def test_file_that_is_not_there(name, presets, refuses):
+    with refuses(ConfigurationError, name=name, limit=presets):
         DbcCodec(name)
 
 
-def test_only_some_words():
+def test_messages_that_are_not_selected_are_ignored():
     codec = DbcCodec('prototype', ('SYNC', 'CLOCK'))
     assert codec.from_links(written(CLOCK)) == CLOCK
     assert codec.to_links(Stop()) == () and codec.to_host(ANGLE) == ()

@@ -79,9 +79,9 @@ def test_wheel(link, angle, speed):
 @repeatable
 @given(links, st.floats(-1e3, 1e3))
 def test_motor(link, torque):
-    frame, = LINK.to_host(MotorReport(link, torque, 7, LinkState.ARMED))
+    frame, = LINK.to_host(MotorReport(link, torque, LinkState.ARMED, 7))
     back = HOST.from_links(frame)
-    assert back == MotorReport(link, pytest.approx(torque, rel=SINGLE, abs=1e-40), None, None)
+    assert back == MotorReport(link, pytest.approx(torque, rel=SINGLE, abs=1e-40))
 
 
 @repeatable
@@ -287,8 +287,9 @@ def test_limits_without_torque_constants_are_those_of_the_odrive():
 @pytest.mark.parametrize('constants', [(0.03,) * 3, (0.03, 0.03, 0.03, inf), (0.0,) * 4,
                                        (0.03, nan, 0.03, 0.03), (-0.03,) * 4])
 def test_impossible_torque_constants(constants):
-    with pytest.raises(BusError, match='torque constants.*motor_torque_constants'):
+    with pytest.raises(BusError) as caught:
         OdriveCodec(torque_constants=constants)
+    assert caught.value.values['name'] == 'motor_torque_constants'
 
 
 @pytest.mark.parametrize('message', [
@@ -318,25 +319,26 @@ def test_no_two_messages_share_an_identifier():
         (0x01, 0x02, 0x07, 0x09, 0x0B, 0x0D, 0x0E, 0x0F, 0x15, 0x17, 0x18, 0x1C)}
 
 
-def test_sensor_boards_that_use_an_identifier_of_an_odrive_are_refused(tmp_path):
+def test_sensor_boards_that_use_an_identifier_of_an_odrive_are_refused(
+        tmp_path, refuses):
     text = (share_directory() / 'config' / 'prototype.dbc').read_text()
     path = tmp_path / 'lab.dbc'
     path.write_text(text.replace(' 304 ', ' 9 '))
-    with pytest.raises(DbcError, match='odrive.dbc .* same identifier 0x009'):
+    odrive = str(share_directory() / 'config' / 'odrive.dbc')
+    with refuses(DbcError, file=odrive, value=0x009):
         OdriveCodec(str(path))
 
 
-@pytest.mark.parametrize('old, new, message', [
-    ('Axis2_Get_Torques', 'Axis2_Torques', 'no message Axis2_Get_Torques'),
-    ('Pos_Estimate', 'Position', 'Axis0_Get_Encoder_Estimates: no signal Pos_Estimate'),
-    ('Axis_Error : 0|32', 'Axis_Error : 0|16', 'Axis_Error is too narrow')])
-def test_file_that_lacks_something_is_refused(tmp_path, old, new, message):
+@pytest.mark.parametrize('old, new, message, signal', [
+    ('Axis2_Get_Torques', 'Axis2_Torques', 'Axis2_Get_Torques', None),
+    ('Pos_Estimate', 'Position', 'Axis0_Get_Encoder_Estimates', 'Pos_Estimate'),
+    ('Axis_Error : 0|32', 'Axis_Error : 0|16', 'Axis0_Heartbeat', 'Axis_Error')])
+def test_file_that_lacks_something_is_refused(tmp_path, old, new, message, signal, refuses):
     text = (share_directory() / 'config' / 'odrive.dbc').read_text()
     path = tmp_path / 'lab.dbc'
     path.write_text(text.replace(old, new))
-    with pytest.raises(DbcError, match=message) as caught:
+    with refuses(DbcError, file=str(path), message=message, signal=signal):
         OdriveCodec(name=str(path))
-    assert str(path) in str(caught.value) and '\n' not in str(caught.value)
 
 
 def test_foreign_frames_are_nobodys():
@@ -372,9 +374,9 @@ def test_what_does_not_fit_is_not_written_by_the_host(message):
 
 @pytest.mark.parametrize('message', [
     *(WheelReport(0, 0, value, TURN, 0, 1, 0.0) for value in (nan, inf)),
-    WheelReport(0, 0, 0.0, TURN, 0, 1, nan), MotorReport(0, nan, 0, LinkState.IDLE),
+    WheelReport(0, 0, 0.0, TURN, 0, 1, nan), MotorReport(0, nan, LinkState.IDLE),
     Heartbeat(0, 0, LinkState.IDLE, frozenset(), nan),
-    Heartbeat(0, 0, LinkState.IDLE, frozenset(), 12.0, inf), MotorReport(4, 0.0, 0, None)],
+    Heartbeat(0, 0, LinkState.IDLE, frozenset(), 12.0, inf), MotorReport(4, 0.0)],
     ids=str)
 def test_what_does_not_fit_is_not_written_by_a_link(message):
     with pytest.raises(FrameError) as caught:
