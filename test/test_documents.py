@@ -19,7 +19,7 @@ from fourbar_ros.plant.energy_budget import EnergyBudget
 from fourbar_ros.plant.fault_schedule import parse_schedule, read_schedule
 from fourbar_ros.plant.faults import FaultKind, SENSOR_FAULTS, WHEEL_FAULTS
 from fourbar_ros.plant.table import SECTIONS
-from fourbar_ros.ros.tables import markdown_text, prototype_text, yaml_text
+from fourbar_ros.ros.parameters import markdown_text, prototype_text, yaml_text
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -27,17 +27,17 @@ PAGES = sorted([ROOT / 'README.md', *(ROOT / 'docs').glob('*.md')])
 
 
 def test_parameter_tables_are_those_of_the_nodes() -> None:
-    """Regenerate with `python -m fourbar_ros.ros.tables --markdown`."""
+    """Regenerate with `python -m fourbar_ros.ros.parameters --markdown`."""
     assert markdown_text() in (ROOT / 'docs' / 'topics.md').read_text()
 
 
 def test_parameters_file_is_that_of_the_nodes() -> None:
-    """Regenerate with `python -m fourbar_ros.ros.tables > config/nodes.yaml`."""
+    """Regenerate with `python -m fourbar_ros.ros.parameters > config/nodes.yaml`."""
     assert (ROOT / 'config' / 'nodes.yaml').read_text() == yaml_text()
 
 
 def test_parameters_file_of_the_prototype_is_that_of_its_scenario() -> None:
-    """Regenerate with `python -m fourbar_ros.ros.tables --prototype`, and so on."""
+    """Regenerate with `python -m fourbar_ros.ros.parameters --prototype`, and so on."""
     assert (ROOT / 'config' / 'nodes_prototype.yaml').read_text() == prototype_text()
 
 

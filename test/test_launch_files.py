@@ -9,7 +9,7 @@ from pathlib import Path
 import sys
 from types import ModuleType, SimpleNamespace
 
-from fourbar_ros.ros.tables import TABLES
+from fourbar_ros.ros.parameters import TABLES
 import pytest
 
 ROOT = Path(__file__).parents[1]

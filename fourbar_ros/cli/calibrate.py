@@ -183,13 +183,13 @@ def _experiment(args: argparse.Namespace) -> Path:
         _confirm(args)
     # A client first: it tells what is wrong with ROS before anything of it is imported.
     with testbed_client(args) as testbed:
-        from fourbar_ros.operator.driven_experiment import DrivenExperiment
+        from fourbar_ros.operator.experiment import Experiment
 
-        experiment = DrivenExperiment(testbed)
-        name = experiment.meet_device()
+        experiment = Experiment(testbed)
+        name = experiment.wait_for_device()
         if args.kind == 'encoders':
             with _progress(args.duration) as progress:
-                experiment.listen(args.duration, progress)
+                experiment.record_at_rest(args.duration, progress)
         else:
             excitation = _excitation(args, load_mechanism(args.mechanism or name))
             with _progress(excitation.duration_s) as progress:

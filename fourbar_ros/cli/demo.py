@@ -148,7 +148,7 @@ def _analysis() -> tuple[Callable[..., dict[str, Any]], Any]:
 
 def _refuse_second_plant(testbed: Any) -> None:
     """Make sure that nobody is driven by accident, neither a real table nor another demo."""
-    if testbed.wait(testbed.device_visible, LOOK_AROUND):
+    if testbed.wait(testbed.has_device, LOOK_AROUND):
         domain = os.environ.get('ROS_DOMAIN_ID', '0')
         raise DemoError(f'a device already runs on ROS_DOMAIN_ID {domain}: stop it, or set '
                         'another ROS_DOMAIN_ID')
@@ -241,7 +241,7 @@ def _move(testbed: Any, processes: Processes, scenario: Scenario, progress_bar: 
     """Wait for everything, arm, move, and stop everything again."""
     # What the report needs, loaded while there is nothing to do but wait.
     import fourbar_ros.analysis.report_figures  # noqa: F401
-    from fourbar_ros.ros.priority import step_back
+    from fourbar_ros.ros.environment import lower_priority
 
     def until(condition: Callable[[], bool], missing: str, seconds: float = START_UP) -> None:
         def checked() -> bool:
@@ -249,24 +249,25 @@ def _move(testbed: Any, processes: Processes, scenario: Scenario, progress_bar: 
             return condition()
         testbed.wait(checked, seconds, missing)
 
-    step_back()
-    testbed.offer_setpoints()
-    testbed.follow(*STATUSES)
-    testbed.follow_joints(*JOINTS)
-    until(lambda: len(testbed.statuses) == len(STATUSES) and len(testbed.joints) == len(JOINTS)
-          and testbed.recorded((names.SETPOINT, *STATUSES, *JOINTS)),
+    lower_priority()
+    testbed.advertise_setpoints()
+    testbed.subscribe_statuses(*STATUSES)
+    testbed.subscribe_joint_states(*JOINTS)
+    until(lambda: len(testbed.statuses) == len(STATUSES)
+          and len(testbed.joint_states) == len(JOINTS)
+          and testbed.is_recorded((names.SETPOINT, *STATUSES, *JOINTS)),
           'the nodes did not find each other')
     # Watching everything would cost the loop as much as a node does.
-    testbed.leave_joints(*(set(JOINTS) - set(WATCHED)))
+    testbed.unsubscribe(*(set(JOINTS) - set(WATCHED)))
     settled_ns = testbed.stamp_ns() + SETTLE_BEFORE * 1e9
     until(lambda: bool(testbed.stamp_ns() >= settled_ns), 'no ticks came')
-    _demand(*testbed.switch(names.ARM, True))
+    _demand(*testbed.call_set_bool(names.ARM, True))
     until(lambda: testbed.statuses[names.DEVICE_STATUS]['state'] == 'armed',
           'no word of the arming')
     until(lambda: _armed(testbed) and testbed.statuses[names.CONTROLLER_STATUS]['mode'] == 'hold',
           'the controller did not notice the arming')
     setpoint = scenario.setpoints[0]
-    accepted, reason = testbed.setpoint(setpoint.names, setpoint.positions)
+    accepted, reason = testbed.send_setpoint(setpoint.names, setpoint.positions)
     _demand(accepted or not _armed(testbed), f'setpoint refused: {reason}')
 
     start_ns = testbed.stamp_ns()
@@ -285,7 +286,7 @@ def _move(testbed: Any, processes: Processes, scenario: Scenario, progress_bar: 
             bar.update(min(elapsed, duration) - bar.n)
             return bool(elapsed >= duration)
         until(arrived, 'the motion did not end', 3.0 * duration)
-    testbed.switch(names.ARM, False)
+    testbed.call_set_bool(names.ARM, False)
 
 
 def _armed(testbed: Any) -> bool:

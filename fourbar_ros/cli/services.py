@@ -16,16 +16,16 @@ from fourbar_ros.common import names
 from fourbar_ros.common.errors import FourbarError
 
 DEVICE = {
-    'arm': lambda testbed: testbed.switch(names.ARM, True),
-    'disarm': lambda testbed: testbed.switch(names.ARM, False),
-    'stop': lambda testbed: testbed.trigger(names.EMERGENCY_STOP),
-    'reset': lambda testbed: testbed.trigger(names.RESET_EMERGENCY_STOP),
+    'arm': lambda testbed: testbed.call_set_bool(names.ARM, True),
+    'disarm': lambda testbed: testbed.call_set_bool(names.ARM, False),
+    'stop': lambda testbed: testbed.call_trigger(names.EMERGENCY_STOP),
+    'reset': lambda testbed: testbed.call_trigger(names.RESET_EMERGENCY_STOP),
 }
 CONTROLLER = {
-    'enable': lambda testbed: testbed.switch(names.ENABLE, True, of='controller'),
-    'disable': lambda testbed: testbed.switch(names.ENABLE, False, of='controller'),
-    'hold': lambda testbed: testbed.trigger(names.HOLD, of='controller'),
-    'damp': lambda testbed: testbed.trigger(names.DAMP, of='controller'),
+    'enable': lambda testbed: testbed.call_set_bool(names.ENABLE, True, server='controller'),
+    'disable': lambda testbed: testbed.call_set_bool(names.ENABLE, False, server='controller'),
+    'hold': lambda testbed: testbed.call_trigger(names.HOLD, server='controller'),
+    'damp': lambda testbed: testbed.call_trigger(names.DAMP, server='controller'),
 }
 
 

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     """Send the setpoint and tell the verdict."""
     goals = [parse_goal(text) for text in args.goals]
     with testbed_client(args) as testbed:
-        accepted, reason = testbed.setpoint(*zip(*goals))
+        accepted, reason = testbed.send_setpoint(*zip(*goals))
     return report_verdict(accepted, 'accepted' if accepted else f'refused: {reason}')
 
 

@@ -11,10 +11,10 @@ from fourbar_ros.cli.ros import add_ros_arguments, report_verdict, testbed_clien
 from fourbar_ros.common import names
 
 CALLS = {
-    'pause': lambda testbed: testbed.switch(names.SIM_PAUSE, True),
-    'resume': lambda testbed: testbed.switch(names.SIM_PAUSE, False),
-    'step': lambda testbed: testbed.trigger(names.SIM_STEP),
-    'reset': lambda testbed: testbed.trigger(names.SIM_RESET),
+    'pause': lambda testbed: testbed.call_set_bool(names.SIM_PAUSE, True),
+    'resume': lambda testbed: testbed.call_set_bool(names.SIM_PAUSE, False),
+    'step': lambda testbed: testbed.call_trigger(names.SIM_STEP),
+    'reset': lambda testbed: testbed.call_trigger(names.SIM_RESET),
 }
 
 EPILOG = """\

@@ -22,9 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print both states."""
     with testbed_client(args) as testbed:
-        testbed.follow(*SOURCES.values())
+        testbed.subscribe_statuses(*SOURCES.values())
         testbed.wait(lambda: len(testbed.statuses) == len(SOURCES), seconds=3.0)
-        if testbed.device_visible():
+        if testbed.has_device():
             # On a busy machine it may be seen before it is heard.
             testbed.wait(lambda: SOURCES['device'] in testbed.statuses)
         statuses = testbed.statuses

@@ -4,18 +4,24 @@
 """
 Record topics into a rosbag2 directory (MCAP), for machines that have no ``ros2 bag``.
 
-Messages are taken off the wire as bytes and written as they are. The bag keeps the quality of
-service each publisher offered, so that ``ros2 bag play`` sends latched topics latched.
+The recorder subscribes to serialized messages and writes them unchanged. The bag keeps the quality
+of service that each publisher offers, so that ``ros2 bag play`` publishes latched topics latched.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from functools import partial
 import importlib
+from pathlib import Path
 import time
+from typing import Any
 
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.ros.priority import step_back
-from fourbar_ros.ros.runtime import Runtime, SPIN_TIMEOUT
-from rclpy.clock import Clock, ClockType
+from fourbar_ros.ros.environment import lower_priority
+from fourbar_ros.ros.runtime import Runtime
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -27,39 +33,45 @@ from rosbags.typesys import get_typestore, Stores, TypesysError
 from tqdm import tqdm
 
 INTERNAL_TOPICS = ('/rosout', '/parameter_events')
-# A disk that stalls for seconds must not cost a message: a closed loop sends 3000 a second.
 QUEUE_DEPTH = 10_000
+"""Messages per topic that wait for a slow disk; a closed loop publishes 3000 a second in all."""
 GRAPH_POLL_S = 0.1
-# What had arrived when the signal came is still in the executor's queue.
+"""Period of the search for new topics [s]."""
 DRAIN_S = 0.3
+"""Time after a signal for the messages in the queue of the executor [s]."""
 
 
 class RecorderError(FourbarError):
-    """The recording cannot start, or had to end."""
+    """The recording cannot start or go on."""
 
 
 class Recorder(Node):
-    """Subscribe to each topic asked for once it has a publisher; write what arrives."""
+    """
+    Subscribes to each requested topic once it has a publisher, and writes its messages.
 
-    def __init__(self, writer, topics, exclude_internal):
+    :ivar counts: number of messages by topic.
+    :ivar failure: why writing failed, '' if it did not.
+    """
+
+    def __init__(self, writer: Writer, topics: Sequence[str], exclude_internal: bool) -> None:
         super().__init__('recorder', enable_rosout=False, start_parameter_services=False)
         for topic in topics:
             validate_topic_name(topic)
-        self.wanted = {self.resolve_topic_name(topic) for topic in topics}
+        self.requested = {self.resolve_topic_name(topic) for topic in topics}
         self.excluded = INTERNAL_TOPICS if exclude_internal else ()
         self.writer = writer
-        self.counts = {}
-        self.failure = None
-        self._publisher_counts = {}
-        self._skipped = set()
+        self.counts: dict[str, int] = {}
+        self.failure = ''
+        self._publisher_counts: dict[str, int] = {}
+        self._skipped: set[str] = set()
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time can stand still
-        self.create_timer(GRAPH_POLL_S, self._follow_graph, clock=steady)
+        self.create_timer(GRAPH_POLL_S, self._check_graph, clock=steady)
 
-    def _follow_graph(self):
+    def _check_graph(self) -> None:
         for topic, types in self.get_topic_names_and_types():
             publishers = self.count_publishers(topic)
-            if not publishers or topic in self._skipped or not self._is_wanted(topic):
+            if not publishers or topic in self._skipped or not self._is_requested(topic):
                 continue
             if topic not in self.counts:
                 self._subscribe(topic, types[0])
@@ -67,14 +79,15 @@ class Recorder(Node):
                 self._check_late_publisher(topic)
             self._publisher_counts[topic] = publishers
 
-    def _is_wanted(self, topic):
-        unwanted = topic in self.excluded or topic_or_service_is_hidden(topic)
-        return topic in self.wanted if self.wanted else not unwanted
+    def _is_requested(self, topic: str) -> bool:
+        if self.requested:
+            return topic in self.requested
+        return topic not in self.excluded and not topic_or_service_is_hidden(topic)
 
-    def _offered(self, topic):
+    def _offered(self, topic: str) -> list[QoSProfile]:
         return [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
 
-    def _subscribe(self, topic, type_name):
+    def _subscribe(self, topic: str, type_name: str) -> None:
         offered = self._offered(topic)
         package, _, name = type_name.partition('/msg/')
         try:
@@ -90,26 +103,27 @@ class Recorder(Node):
         self.create_subscription(message_type, topic, partial(self._write, topic, connection),
                                  matching_qos(offered), raw=True)
 
-    def _write(self, topic, connection, data):
+    def _write(self, topic: str, connection: Any, data: bytes) -> None:
         if self.failure:
             return
         try:
             self.writer.write(connection, time.time_ns(), data)
             self.counts[topic] += 1
-        except OSError as error:  # out of a callback it would be a FATAL and a traceback
+        except OSError as error:  # leaving a callback it would print FATAL and a traceback
             self.failure = f'cannot write to {self.writer.path}: {error.strerror}'
 
-    def _check_late_publisher(self, topic):
+    def _check_late_publisher(self, topic: str) -> None:
         subscribed = next(s for s in self.subscriptions if s.topic_name == topic).qos_profile
         needed = matching_qos(self._offered(topic))
-        # In both enumerations of the middleware the weaker policy is the larger number.
+        # In both enumerations of the middleware the weaker policy has the larger number.
         if (needed.reliability > subscribed.reliability
                 or needed.durability > subscribed.durability):
-            tqdm.write(f'not recording a late publisher of {topic}: it offers less than the first')
+            tqdm.write(f'not recording a late publisher of {topic}: its quality of service is '
+                       'weaker than that of the first')
 
 
-def matching_qos(offered):
-    """Return the strongest subscription that matches every publisher (a QoSProfile each)."""
+def matching_qos(offered: Sequence[QoSProfile]) -> QoSProfile:
+    """Return the strongest quality of service of a subscription to all of these publishers."""
     reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
     latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
     return QoSProfile(
@@ -118,8 +132,8 @@ def matching_qos(offered):
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
 
 
-def offered_qos(qos):
-    """Convert a QoSProfile of rclpy to what rosbags writes."""
+def offered_qos(qos: QoSProfile) -> bag.Qos:
+    """Convert a QoSProfile of rclpy to that of rosbags."""
     deadline, lifespan, lease = (
         bag.QosTime(*divmod(duration.nanoseconds, 10**9))
         for duration in (qos.deadline, qos.lifespan, qos.liveliness_lease_duration))
@@ -129,26 +143,28 @@ def offered_qos(qos):
         bag.QosLiveliness(int(qos.liveliness)), lease, qos.avoid_ros_namespace_conventions)
 
 
-def record(directory, topics=(), *, exclude_internal=False, ros_args=(), live=False):
+def record(directory: Path, topics: Sequence[str] = (), *, exclude_internal: bool = False,
+           ros_args: Sequence[str] = (), live: bool = False) -> dict[str, int]:
     """
     Record until SIGINT, SIGTERM or SIGHUP.
 
-    :param directory: the bag to make; nothing is made if the recording cannot start.
-    :param topics: names to record, relative ones in the node's namespace; empty: all.
-    :param ros_args: what follows ``--ros-args`` on the command line.
-    :param live: show a running count.
+    :param directory: the new bag; not created if the recording cannot start.
+    :param topics: names, relative ones in the namespace of the node; empty for all.
+    :param ros_args: arguments after ``--ros-args``.
+    :param live: show the number of messages.
     :returns: number of messages by topic.
-    :raises RecorderError: it cannot start, or cannot write.
+    :raises RecorderError: the recording cannot start, or the bag cannot be written.
     """
-    step_back()
-    runtime, node = Runtime(['--ros-args', *ros_args]), None
+    lower_priority()
+    runtime = Runtime(['--ros-args', *ros_args])
+    node: Recorder | None = None
     try:
         writer = Writer(directory, version=9, storage_plugin=StoragePlugin.MCAP)
         node = Recorder(writer, topics, exclude_internal)
         runtime.executor.add_node(node)
         with writer, tqdm(unit=' messages', disable=not live, leave=False) as progress:
             tqdm.write(f'recording to {directory}')
-            _spin(runtime, node, progress)
+            _record_until_signal(runtime, node, progress)
     except InvalidTopicNameException as error:
         raise RecorderError(' '.join(str(error).rstrip(' ^\n').split())) from error
     except (WriterError, OSError) as error:
@@ -160,10 +176,10 @@ def record(directory, topics=(), *, exclude_internal=False, ros_args=(), live=Fa
     return node.counts
 
 
-def _spin(runtime, node, progress):
+def _record_until_signal(runtime: Runtime, node: Recorder, progress: Any) -> None:
     while not runtime.stopping and not node.failure:
-        runtime.executor.spin_once(timeout_sec=SPIN_TIMEOUT)
+        runtime.spin_once()
         progress.update(sum(node.counts.values()) - progress.n)
     end = time.monotonic() + DRAIN_S
     while time.monotonic() < end:
-        runtime.executor.spin_once(timeout_sec=0.05)
+        runtime.spin_once(0.05)

@@ -1,164 +1,325 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The ROS shell of a testbed, simulated or real: same topics, same services, same rules."""
+"""The node of a device, simulated or real: same topics, services, parameters and rules."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from fourbar_ros.common import names
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.monotonic_clock import monotonic_ns
 from fourbar_ros.common.named_values import RejectedError
-from fourbar_ros.common.settings import settings_of
-from fourbar_ros.device import ClockModeError, DeviceSupervisor, SupervisorSettings
+from fourbar_ros.common.settings import Setting, settings_of
+from fourbar_ros.device import (
+    ClockMode,
+    ClockModeError,
+    Device,
+    DeviceSupervisor,
+    RealtimeClock,
+    Samples,
+    SupervisorSettings,
+    Timing,
+)
 from fourbar_ros.device.arming import DeviceState
-from fourbar_ros.ros.device_topics import DeviceTopics, LEVELS
-from fourbar_ros.ros.gate_services import GateServices
+from fourbar_ros.mechanism import FLYWHEEL_NAMES
+from fourbar_ros.ros.base_node import BaseNode, settings_from
 from fourbar_ros.ros.messages import (
-    Diagnostics,
+    create_steady_timer,
+    DiagnosticsPublisher,
+    ERROR,
+    JointStatePublisher,
+    LATCHED,
     OK,
-    RareLog,
-    Recently,
+    RecentIncrease,
     RELIABLE,
+    Report,
     stamp_of,
+    status_message,
+    TABLE_FRAME,
+    ThrottledLog,
     WARN,
 )
-from fourbar_ros.ros.paces import realtime_pace
-from fourbar_ros.ros.parameters import declare
-from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
+from fourbar_ros.ros.runtime import Runtime
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
+from std_srvs.srv import SetBool, Trigger
+
+CATCH_UP_NS = 100_000_000
+"""Longest delay after which every missed tick is still made [ns]."""
+SINGLE_PUBLISHER = (names.FLYWHEEL_COMMAND, names.LINK_ANGLES)
+"""Topics with at most one publisher while armed: a second controller or device is an error."""
+LEVELS = {DeviceState.DISARMED: OK, DeviceState.ARMED: OK,
+          DeviceState.EMERGENCY_STOP: ERROR, DeviceState.FAULT: ERROR}
+TIMING_NAMES = ('round_trip_s', 'command_age_s', 'lost', 'step_s')
 
 
-class DeviceNode(Node):
+def device_parameters(mechanism: str) -> tuple[Setting, ...]:
     """
-    Drive a device tick by tick and let its commands through the arming gate.
+    Return the declarations of the parameters that all devices have.
 
-    :param parameters: the node's table, the common ones among them.
-    :param make_device: called with the values of all parameters, the period [ns], and what turns
-        the time of the steady clock into that of stamps [ns], once there are ticks.
-    :param make_pace: called with the same, returns the pace and how often to look at it [ns].
+    :param mechanism: default of that parameter.
+    """
+    return (
+        Setting('mechanism', mechanism, '', 'preset or path of a mechanism file'),
+        *settings_of(SupervisorSettings),
+    )
+
+
+class DeviceNode(BaseNode):
+    """
+    Advance a device tick by tick, and pass commands on while it is armed.
+
+    :param declarations: of all parameters, `device_parameters` among them.
     """
 
-    def __init__(self, runtime, name, parameters, make_device, make_pace=None):
-        super().__init__(name)
-        guard = runtime.guard
-        # Changed in place when somebody sets a parameter.
-        self._values = values = declare(self, parameters, self.parameters_changed)
-        period_ns = round(1e9 / values['rate'])
-        self._testbed = DeviceSupervisor(
-            make_device(values, period_ns, lambda time_ns: self._pace.now_ns(time_ns)),
-            SupervisorSettings(**{row.name: values[row.name]
-                                  for row in settings_of(SupervisorSettings)}))
-        device = self._testbed.device
-        self._log, self._errors, self._rejected = RareLog(self), RareLog(self), Recently()
-        self._topics = DeviceTopics(self, self._testbed, values['mechanism'])
-        self.create_subscription(JointState, 'flywheel_command', guard(self._on_command), RELIABLE)
-        GateServices(self, self._testbed, guard, self.now_ns, self._announce)
-        self._diagnostics = Diagnostics(self, device.description, self._collect, guard)
+    def __init__(self, runtime: Runtime, name: str, declarations: Sequence[Setting]) -> None:
+        super().__init__(runtime, name, declarations)
+        values, guard = self.values, runtime.guard
+        settings = settings_from(SupervisorSettings, values)
+        self.period_ns = settings.period_ns
+        self._supervisor = DeviceSupervisor(self.make_device(), settings)
+        device = self._supervisor.device
+        self._log, self._error_log = ThrottledLog(self), ThrottledLog(self)
+        self._rejected = RecentIncrease()
+        self._publishers_of_device = DevicePublishers(self, self._supervisor, values['mechanism'])
+        self.create_subscription(
+            JointState, names.FLYWHEEL_COMMAND, guard(self._on_command), RELIABLE)
+        self.create_subscription(
+            Bool, names.EMERGENCY_STOP_REQUEST, guard(self._on_emergency_stop_request), RELIABLE)
+        self.create_service(SetBool, names.ARM, guard(self._on_arm))
+        self.create_service(Trigger, names.EMERGENCY_STOP, guard(self._on_emergency_stop))
+        self.create_service(
+            Trigger, names.RESET_EMERGENCY_STOP, guard(self._on_reset_emergency_stop))
+        self._diagnostics = DiagnosticsPublisher(self, device.description, self._report)
         self._catching_up = False
-        self._soon = lambda callback: runtime.executor.create_task(guard(callback))
-        # One after the other, so that the timer fires right after a tick is due.
-        self._pace, poll_ns = (make_pace or realtime_pace)(values, period_ns)
-        self.create_timer((poll_ns + 0.5) * 1e-9, guard(self._on_timer),  # rclpy rounds down
-                          clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._announce()
-        self.get_logger().info(
+        # The clock starts just before its timer, so that the timer fires right after a tick is
+        # due.
+        self.clock_mode, poll_ns = self.make_clock_mode()
+        # rclpy rounds the period down to whole nanoseconds.
+        create_steady_timer(self, (poll_ns + 0.5) * 1e-9, self._on_timer)
+        self.publish_status()
+        self.logger.info(
             f'{device.description} with mechanism {values["mechanism"]} at {values["rate"]:g} Hz')
 
-    def parameters_changed(self, values):
-        """Take note of other parameters; what is raised here refuses them."""
+    def make_device(self) -> Device:
+        """Return the device that the parameters describe."""
+        raise NotImplementedError
 
-    def close(self):
-        """Leave the wheels without torque, and say so."""
-        self._testbed.close()
-        self._announce()
+    def make_clock_mode(self) -> tuple[ClockMode, int]:
+        """Return the clock that ticks follow, and the period of polling it [ns]."""
+        return (RealtimeClock(time.time_ns(), monotonic_ns(), self.period_ns, CATCH_UP_NS),
+                self.period_ns)
 
-    def now_ns(self):
-        """Read the clock of the watchdogs, on the scale of the stamps [ns]."""
-        return self._pace.now_ns(monotonic_ns())
+    def tick_published(self, samples: Samples) -> None:
+        """Publish further topics of a tick, after its samples."""
 
-    def ticked(self, stamp_ns, truth):
-        """Do what else belongs to a tick, after it went out; `truth` where a device has it."""
-
-    def hindrance(self):
-        """Tell what keeps ticks from coming, '' if nothing does."""
+    def stall_reason(self) -> str:
+        """Return why no ticks are made, '' if they are."""
         return ''
 
-    def _on_timer(self):
-        if not self._catching_up:
-            self.advance()
+    def close(self) -> None:
+        """Remove the torque from the wheels, and publish the status."""
+        self._supervisor.close()
+        self.publish_status()
 
-    def advance(self):
-        """Make one tick that is due; the next one, if it is late too, after waiting commands."""
+    def now_ns(self) -> int:
+        """Return the time of the watchdogs, on the scale of the stamps [ns]."""
+        return self.clock_mode.now_ns(monotonic_ns())
+
+    def advance(self) -> None:
+        """
+        Make one tick that is due, and schedule the next one if that is due as well.
+
+        Commands that arrived in between are handled before the next tick.
+        """
         self._catching_up = False
-        # Nothing moves while the device is broken, so no tick is taken that would not go out.
-        if self._testbed.gate.state is not DeviceState.FAULT:
-            stamp_ns = self._pace.due(monotonic_ns())
+        if self._supervisor.gate.state is not DeviceState.FAULT:
+            stamp_ns = self.clock_mode.due(monotonic_ns())
             if stamp_ns is not None:
                 self._tick(stamp_ns)
-            self._catching_up = self._pace.is_due(monotonic_ns())
-        self._announce()
+            self._catching_up = self.clock_mode.is_due(monotonic_ns())
+        self.publish_status()
         if self._catching_up:
-            self._soon(self.advance)
+            self.runtime.executor.create_task(self.runtime.guard(self.advance))
 
-    def step(self):
+    def step(self) -> int:
         """
         Make one tick while paused.
 
         :returns: its stamp [ns].
-        :raises FourbarError: it is not paused, or there can be no tick now.
+        :raises FourbarError: the clock is not paused, or no tick can be made now.
         """
-        gate = self._testbed.gate
+        gate = self._supervisor.gate
         if gate.state is DeviceState.FAULT:
             raise ClockModeError(
                 f'{gate.state.value} ({gate.reason}), call reset_emergency_stop first')
-        stamp_ns = self._pace.step(monotonic_ns())
+        stamp_ns = self.clock_mode.step(monotonic_ns())
         self._tick(stamp_ns)
-        self._announce()
+        self.publish_status()
         return stamp_ns
 
-    def _tick(self, stamp_ns):
-        begin_ns = monotonic_ns()
-        try:
-            samples, timing = self._testbed.tick(stamp_ns, self.now_ns())
-        except FourbarError as error:
-            self._pace.give_up()
-            self._errors.error(f'{error}: the device stands still')
-            return
-        step_ns = monotonic_ns() - begin_ns
-        # Whoever answers the tick should know by then what state the device is in.
-        self._announce()
-        self._topics.publish_samples(samples)
-        if not samples.complete:
-            return
-        self._testbed.published(self.now_ns(), step_ns)
-        self._topics.publish_timing(stamp_ns, timing)
-        self.ticked(stamp_ns, samples.truth)
+    def publish_status(self) -> None:
+        """Publish device_status and the diagnostics if the arming state changed."""
+        if self._publishers_of_device.publish_status_changes():
+            self._diagnostics.publish_changes()
 
-    def _on_command(self, message):
-        stamp_ns = stamp_of(message)
-        clipped = self._testbed.clipped
-        try:
-            self._testbed.command(stamp_ns, message.name, message.position,
-                                  message.velocity, message.effort, self.now_ns())
-        except RejectedError as error:
-            self._log.warn(f'flywheel_command rejected: {error}')
-        if self._testbed.clipped > clipped:
-            self._log.warn('flywheel_command asks more than a motor has: clipped')
-        # Even a rejected one: the last good command holds until the watchdog, as ever.
-        if self._pace.answered(stamp_ns) and not self._catching_up:
+    def publish_diagnostics_changes(self) -> None:
+        """Publish the diagnostics if level or summary changed."""
+        self._diagnostics.publish_changes()
+
+    def repeat_tick(self, links: bool) -> None:
+        """
+        Publish the last tick again, unchanged.
+
+        :param links: also its link angles.
+        """
+        self._publishers_of_device.publish_samples(links)
+
+    def disarm(self, reason: str) -> None:
+        """Disarm the device."""
+        self._supervisor.disarm(reason)
+
+    def _on_timer(self) -> None:
+        if not self._catching_up:
             self.advance()
 
-    def _announce(self):
-        """Publish the gate's state if it changed."""
-        if self._topics.announce():
-            self._diagnostics.changed()
+    def _tick(self, stamp_ns: int) -> None:
+        begin_ns = monotonic_ns()
+        try:
+            samples, timing = self._supervisor.tick(stamp_ns, self.now_ns())
+        except FourbarError as error:
+            self.clock_mode.give_up()
+            self._error_log.error(f'{error}: the device stands still')
+            return
+        step_ns = monotonic_ns() - begin_ns
+        # The status precedes the tick: a node that answers the tick knows the state.
+        self.publish_status()
+        self._publishers_of_device.samples = samples
+        self._publishers_of_device.publish_samples(links=True)
+        if not samples.complete:
+            return
+        self._supervisor.published(self.now_ns(), step_ns)
+        self._publishers_of_device.publish_timing(timing)
+        self.tick_published(samples)
 
-    def _collect(self):
-        gate = self._testbed.gate
+    def _on_command(self, message: JointState) -> None:
+        stamp_ns = stamp_of(message)
+        clipped = self._supervisor.clipped
+        try:
+            self._supervisor.command(stamp_ns, message.name, message.position,
+                                     message.velocity, message.effort, self.now_ns())
+        except RejectedError as error:
+            self._log.warn(f'flywheel_command rejected: {error}')
+        if self._supervisor.clipped > clipped:
+            self._log.warn('flywheel_command exceeds a motor limit: clipped')
+        # A rejected command answers the tick too: the last valid command holds until the watchdog
+        # stops it.
+        if self.clock_mode.answered(stamp_ns) and not self._catching_up:
+            self.advance()
+
+    def _on_arm(self, request: Any, response: Any) -> Any:
+        if request.data:
+            response.success, response.message = self._supervisor.arm(
+                self.now_ns(), self._arming_blockers())
+        else:
+            self._supervisor.disarm('disarmed on request')
+            response.success, response.message = True, self._supervisor.gate.state.value
+        self.publish_status()
+        return response
+
+    def _arming_blockers(self) -> list[str]:
+        counts = {topic: self.count_publishers(self.resolve_topic_name(topic))
+                  for topic in SINGLE_PUBLISHER}
+        return [f'{topic} has {count} publishers, limit 1'
+                for topic, count in counts.items() if count > 1]
+
+    def _on_emergency_stop(self, _request: Any, response: Any) -> Any:
+        self._supervisor.emergency_stop('emergency_stop service')
+        response.success, response.message = True, 'stopped, the wheels coast'
+        self.publish_status()
+        return response
+
+    def _on_reset_emergency_stop(self, _request: Any, response: Any) -> Any:
+        response.success, response.message = self._supervisor.reset()
+        self.publish_status()
+        return response
+
+    def _on_emergency_stop_request(self, message: Bool) -> None:
+        if message.data:
+            self._supervisor.emergency_stop('emergency_stop_request')
+            self.publish_status()
+
+    def _report(self) -> Report:
+        gate = self._supervisor.gate
         level, summary = LEVELS[gate.state], gate.state.value
-        if self._rejected.grew(self._testbed.rejected.total()) and level == OK:
+        if self._rejected.update(self._supervisor.rejected.total()) and level == OK:
             level, summary = WARN, f'{summary}, commands were rejected'
-        for trouble in filter(None, (self.hindrance(), *self._testbed.device.diagnostics())):
-            level, summary = max(level, WARN), f'{summary}, {trouble}'
+        for text in filter(None, (self.stall_reason(), *self._supervisor.device.diagnostics())):
+            level, summary = max(level, WARN), f'{summary}, {text}'
         return level, summary, {
-            **self._testbed.diagnostics(), 'ticks_skipped': self._pace.skipped,
-            'ticks': self._pace.ticks}
+            **self._supervisor.diagnostics(), 'ticks_skipped': self.clock_mode.skipped,
+            'ticks': self.clock_mode.ticks}
+
+
+class DevicePublishers:
+    """
+    Publishers of samples, timing and arming state.
+
+    :param mechanism: its name, a value of device_status.
+    :ivar samples: of the last tick.
+    """
+
+    samples: Samples
+
+    def __init__(self, node: DeviceNode, supervisor: DeviceSupervisor, mechanism: str) -> None:
+        self._node = node
+        self._gate = supervisor.gate
+        self._device = device = supervisor.device
+        self._mechanism = mechanism
+        self._published_state: tuple[DeviceState, str, int] | None = None
+        self._links = JointStatePublisher(
+            node, names.LINK_ANGLES, device.sensor_names,
+            ('position', 'velocity') if device.measures_rates else ('position',), TABLE_FRAME)
+        self._wheels = JointStatePublisher(
+            node, names.FLYWHEEL_STATES, FLYWHEEL_NAMES, ('position', 'velocity', 'effort'))
+        self._timing = JointStatePublisher(node, names.TIMING, TIMING_NAMES, ('position',))
+        self._status = node.create_publisher(DiagnosticStatus, names.DEVICE_STATUS, LATCHED)
+
+    def publish_samples(self, links: bool) -> None:
+        """
+        Publish link angles and then flywheel_states, which is the tick.
+
+        :param links: whether to publish the link angles.
+        """
+        samples, wheels = self.samples, self.samples.wheels
+        for sample in samples.links if links else ():
+            self._links.publish(sample.stamp_ns, sample.angles, sample.rates, names=sample.names)
+        if samples.complete:
+            self._wheels.publish(samples.stamp_ns, wheels.angles, wheels.speeds, wheels.efforts)
+
+    def publish_timing(self, timing: Timing) -> None:
+        """Publish the timing of the loop and of the device; unknown scalars are left out."""
+        scalars = {name: getattr(timing, name) for name in TIMING_NAMES}
+        scalars.update(zip(self._device.timing_names, self.samples.timing))
+        known = {name: value for name, value in scalars.items() if value is not None}
+        self._timing.publish(self.samples.stamp_ns, list(known.values()), names=tuple(known))
+
+    def publish_status_changes(self) -> bool:
+        """Publish device_status if the arming state changed; return whether it did."""
+        gate = self._gate
+        state = gate.state, gate.reason, gate.since_ns
+        if state == self._published_state:
+            return False
+        self._published_state = state
+        text = f'{gate.state.value}: {gate.reason}'
+        self._status.publish(status_message(
+            self._node, self._device.description, LEVELS[gate.state], text, {
+                'state': gate.state.value, 'reason': gate.reason,
+                'since': f'{gate.since_ns * 1e-9:.9f}', 'mechanism': self._mechanism}))
+        self._node.logger.info(text)
+        return True

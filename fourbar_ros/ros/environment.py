@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Whether there is a usable ROS 2 Jazzy, told before rclpy is imported.
+Checks of the ROS environment and priorities of the process; imports no rclpy.
 
-rcl ends the process from inside the import where the middleware is the wrong one, so everything
-is looked up without importing it.
+With the wrong middleware rcl ends the process while rclpy is imported, so the checks come first
+and look everything up without importing it.
 """
 
+from __future__ import annotations
+
+from contextlib import suppress
 import ctypes
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -15,42 +18,66 @@ import os
 
 from fourbar_ros.common.errors import FourbarError
 
-# The first rclpy with the executor that the nodes run on.
 OLDEST_RCLPY = (7, 1, 4)
+"""First version of rclpy with the EventsExecutor."""
 LARGEST_DOMAIN = 232
+"""Largest domain id whose ports are below 65536."""
 
 
 class RosError(FourbarError):
-    """ROS is missing, foreign, or refused what it was asked."""
+    """ROS is missing, has the wrong version, or refused a request."""
 
 
-def check_environment():
+def check_environment() -> None:
     """
-    Refuse what would fail later with a message that nobody understands.
+    Refuse an environment in which rclpy would fail with an unclear message.
 
-    :raises RosError: no or a foreign rclpy, unusable middleware, bad domain id.
+    :raises RosError: rclpy is missing or not of Jazzy, the middleware is not installed, or the
+        domain id is out of range.
     """
     spec = find_spec('rclpy')
     if spec is None:
         raise RosError('rclpy is missing: source a ROS 2 Jazzy installation, or make install')
     try:
-        found = version('rclpy')
+        installed = version('rclpy')
     except PackageNotFoundError:
-        found = 'of unknown version'
-    numbers = tuple(int(part) for part in found.split('.')[:3] if part.isdigit())
-    if not OLDEST_RCLPY <= numbers < (OLDEST_RCLPY[0] + 1,):
-        where = os.path.dirname(spec.origin or '')
+        installed = 'of unknown version'
+    parts = tuple(int(part) for part in installed.split('.')[:3] if part.isdigit())
+    if not OLDEST_RCLPY <= parts < (OLDEST_RCLPY[0] + 1,):
+        folder = os.path.dirname(spec.origin or '')
         oldest = '.'.join(map(str, OLDEST_RCLPY))
-        raise RosError(f'rclpy {found} in {where} is not that of ROS 2 Jazzy ({oldest} or a later '
-                       f'{OLDEST_RCLPY[0]}): is another ROS sourced?')
+        raise RosError(
+            f'rclpy {installed} in {folder} is not of ROS 2 Jazzy ({oldest} or a later '
+            f'{OLDEST_RCLPY[0]}): is another ROS sourced?',
+            name='rclpy', value=installed, limit=oldest)
     domain = os.environ.get('ROS_DOMAIN_ID', '')
     if domain and not (domain.isascii() and domain.isdigit() and int(domain) <= LARGEST_DOMAIN):
-        raise RosError(f'ROS_DOMAIN_ID must be a whole number from 0 to {LARGEST_DOMAIN}, '
-                       f'not {domain!r}')
+        raise RosError(
+            f'ROS_DOMAIN_ID must be a whole number from 0 to {LARGEST_DOMAIN}, not {domain!r}',
+            name='ROS_DOMAIN_ID', value=domain, limit=LARGEST_DOMAIN)
     middleware = os.environ.get('RMW_IMPLEMENTATION', '')
     if middleware:
         try:
             ctypes.CDLL(f'lib{middleware}.so')
         except OSError:
-            raise RosError(f'RMW_IMPLEMENTATION is {middleware!r}, which is not installed here: '
-                           'unset it or install it') from None
+            raise RosError(
+                f'RMW_IMPLEMENTATION is {middleware!r}, which is not installed here: unset it or '
+                'install it', name='RMW_IMPLEMENTATION', value=middleware) from None
+
+
+def raise_priority() -> None:
+    """
+    Give all threads of this process real-time priority, if the user has it (limit `rtprio`).
+
+    The lowest real-time priority is above every process without one. Without the permission
+    nothing changes.
+    """
+    with suppress(PermissionError):
+        for thread in os.listdir('/proc/self/task'):
+            os.sched_setscheduler(
+                int(thread), os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+
+
+def lower_priority() -> None:
+    """Lower the priority of a process that only records or monitors."""
+    os.nice(5)

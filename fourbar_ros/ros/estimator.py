@@ -3,7 +3,11 @@
 
 """The estimator as a node: link angles and ticks in, estimates out."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 from fourbar_ros.common.names import (
     ESTIMATE_RESET,
@@ -14,108 +18,106 @@ from fourbar_ros.common.names import (
 from fourbar_ros.estimation import EstimatorSettings
 from fourbar_ros.estimation.estimator import BY_SPEED
 from fourbar_ros.estimation.parameters import PARAMETERS
-from fourbar_ros.estimation.topics import EstimatorTopics, INPUTS, OUTPUTS
+from fourbar_ros.estimation.topics import EstimatorTopics, INPUTS, Message, OUTPUTS
 from fourbar_ros.mechanism import load_mechanism
+from fourbar_ros.ros.base_node import BaseNode, run_node
 from fourbar_ros.ros.messages import (
-    Diagnostics,
+    DiagnosticsPublisher,
     JointStatePublisher,
     OK,
-    RareLog,
-    Recently,
+    RecentIncrease,
     RELIABLE,
-    sensor_quality,
+    Report,
+    sensor_qos,
     stamp_of,
+    ThrottledLog,
     WARN,
+    write_stamp,
 )
-from fourbar_ros.ros.parameters import declare
-from fourbar_ros.ros.runtime import run_node
-from rclpy.node import Node
+from fourbar_ros.ros.runtime import Runtime
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-# Whether the diagnosis has changed is looked after every so many ticks: it takes time.
-LOOK_EVERY = 5
+TICKS_PER_DIAGNOSTICS = 5
+"""Ticks between two comparisons of the diagnostics, which take time."""
 
 
-class EstimatorNode(Node):
-    """Hand messages to the estimator and its estimates to whoever listens."""
+class EstimatorNode(BaseNode):
+    """Pass messages to the estimator, and publish its estimates."""
 
-    def __init__(self, runtime):
-        super().__init__('estimator')
-        self._runtime = runtime
-        values = declare(self, PARAMETERS)
+    def __init__(self, runtime: Runtime) -> None:
+        super().__init__(runtime, 'estimator', PARAMETERS)
+        values = dict(self.values)
         self._topics = EstimatorTopics(
             load_mechanism(values.pop('mechanism')), EstimatorSettings(**values))
         self._estimator = self._topics.estimator
-        self._log, self._rejected = RareLog(self), Recently()
-        self._listens_to_commands, self._starts, self._ticks = False, 0, 0
-        self._outputs = {}
+        self._log, self._rejected = ThrottledLog(self), RecentIncrease()
+        self._subscribed_to_commands, self._starts, self._ticks = False, 0, 0
+        self._outputs: dict[str, JointStatePublisher] = {}
         for topic, output in OUTPUTS.items():
             if not output.optional:
-                self._offer(topic)
+                self._create_output(topic)
         self._waiting = self.create_publisher(Header, ESTIMATE_WAITING, RELIABLE)
         self.create_service(Trigger, ESTIMATE_RESET, runtime.guard(self._on_reset))
-        self._diagnostics = Diagnostics(self, '', self._collect, runtime.guard)
+        self._diagnostics = DiagnosticsPublisher(self, '', self._report)
         for topic in INPUTS:
-            self._listen(topic)
+            self._subscribe(topic)
 
-    def _offer(self, topic):
+    def _create_output(self, topic: str) -> None:
         output = OUTPUTS[topic]
         self._outputs[topic] = JointStatePublisher(
             self, topic, output.names, output.fields, output.frame)
 
-    def _listen(self, topic):
-        self.create_subscription(JointState, topic, self._runtime.guard(
-            partial(self._receive, topic)), sensor_quality(self))
+    def _subscribe(self, topic: str) -> None:
+        self.create_subscription(JointState, topic, self.runtime.guard(
+            partial(self._on_input, topic)), sensor_qos(self))
 
-    def close(self):
-        """Nothing is left to do."""
-
-    def _receive(self, topic, message):
+    def _on_input(self, topic: str, message: JointState) -> None:
         answer = self._topics.receive(topic, stamp_of(message), message.name, message.position,
                                       message.velocity, message.effort)
         if answer.rejection:
             self._log.warn(f'{topic} rejected: {answer.rejection}')
-        for published in answer.messages:
-            self._publish(published)
+        for output in answer.messages:
+            self._publish(output)
         if topic == FLYWHEEL_STATES and not answer.rejection:
-            self._tell_starts()
+            self._log_starts()
             self._ticks += 1
-            if self._ticks % LOOK_EVERY == 0:
-                self._diagnostics.changed()
-            if self._topics.needs_commands and not self._listens_to_commands:
-                # Only here: these messages cost time at every tick.
-                self._listens_to_commands = True
-                self._listen(FLYWHEEL_COMMAND)
+            if self._ticks % TICKS_PER_DIAGNOSTICS == 0:
+                self._diagnostics.publish_changes()
+            if self._topics.needs_commands and not self._subscribed_to_commands:
+                # Only now: these messages take time at every tick.
+                self._subscribed_to_commands = True
+                self._subscribe(FLYWHEEL_COMMAND)
 
-    def _tell_starts(self):
+    def _log_starts(self) -> None:
         starts = self._estimator.starts
         if starts != self._starts:
             self._starts = starts
-            self.get_logger().info(
-                'started' if starts == 1 else f'acquired the linkage anew, start {starts}')
+            self.logger.info(
+                'started' if starts == 1 else f'acquired the linkage again, start {starts}')
 
-    def _publish(self, message):
-        if message.topic == ESTIMATE_WAITING:
-            stamp = Header()
-            stamp.stamp.sec, stamp.stamp.nanosec = divmod(message.stamp_ns, 1_000_000_000)
-            self._waiting.publish(stamp)
+    def _publish(self, output: Message) -> None:
+        if output.topic == ESTIMATE_WAITING:
+            header = Header()
+            write_stamp(header.stamp, output.stamp_ns)
+            self._waiting.publish(header)
             return
-        if message.topic not in self._outputs:
-            self._offer(message.topic)
-        self._outputs[message.topic].publish(
-            message.stamp_ns, *message.values, names=message.names)
+        if output.topic not in self._outputs:
+            self._create_output(output.topic)
+        self._outputs[output.topic].publish(
+            output.stamp_ns, *output.values, names=output.names)
 
-    def _on_reset(self, _request, response):
+    def _on_reset(self, _request: Any, response: Any) -> Any:
         self._estimator.reset()
-        self.get_logger().info('reset on request')
+        self.logger.info('reset on request')
         response.success, response.message = True, 'starts again from the next link_angles'
         return response
 
-    def _collect(self):
+    def _report(self) -> Report:
         estimator = self._estimator
-        values = {'starts': estimator.starts, 'last_rejection': estimator.last_rejection}
+        values: dict[str, object] = {
+            'starts': estimator.starts, 'last_rejection': estimator.last_rejection}
         values.update((f'rejected_{kind}', count)
                       for kind, count in sorted(estimator.rejected.items()))
         values.update((f'gated_{name}', count) for name, count in sorted(estimator.gated.items()))
@@ -128,12 +130,12 @@ class EstimatorNode(Node):
             return WARN, f'running, {faults}', values
         if estimator.driven_by != BY_SPEED:
             return WARN, f'running without wheel speeds, driven by {estimator.driven_by}', values
-        if self._rejected.grew(estimator.rejected.total()):
+        if self._rejected.update(estimator.rejected.total()):
             return WARN, 'running, measurements were rejected', values
         return OK, 'running', values
 
 
-def main(argv):
+def main(argv: Sequence[str]) -> int:
     """Run the node."""
     return run_node(
         EstimatorNode, 'estimator', 'Kalman filter on link angles and wheel motion.', argv)

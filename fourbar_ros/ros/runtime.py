@@ -1,153 +1,132 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How every node starts, runs and ends."""
+"""rclpy of one process: context, executor, signals and shutdown."""
 
-import argparse
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
 import gc
 import signal
 import time
+from typing import Any
 
-from fourbar_ros.kernels.compiler import announced
-from fourbar_ros.ros.environment import RosError
-from fourbar_ros.ros.priority import go_first
+from fourbar_ros.ros.environment import raise_priority, RosError
 import rclpy
 from rclpy.duration import Duration
-from rclpy.exceptions import (
-    InvalidNamespaceException,
-    InvalidNodeNameException,
-    InvalidTopicNameException,
-    ParameterException,
-)
 from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
+from rclpy.utilities import try_shutdown
 
-# The executor of these wheels hangs in any wait without a time limit [s].
 SPIN_TIMEOUT = 0.2
-
-# How long a node that ends waits for others to take what it said last [s].
-LAST_WORDS = 0.5
+"""Longest wait of the executor for a callback [s]; the one of Jazzy hangs in endless waits."""
+FLUSH_TIMEOUT = 0.5
+"""Longest wait at the end for subscribers to acknowledge the last messages [s]."""
 
 
 class Runtime:
     """
-    ROS of one process: context, executor, and signals that only raise a flag.
+    Context and executor of one process, with signal handlers that only set a flag.
 
-    rclpy's own signal handling ends the context before anybody can send a last zero torque.
+    The signal handlers of rclpy shut the context down before a node can publish a last zero
+    torque.
+
+    :param ros_args: arguments of ROS, `--ros-args` included.
+    :ivar stopping: whether SIGINT, SIGTERM or SIGHUP arrived.
+    :ivar failure: first exception that a guarded callback raised, or None.
+    :raises RosError: rcl refuses the arguments.
     """
 
-    def __init__(self, ros_args=()):
+    def __init__(self, ros_args: Sequence[str] = ()) -> None:
         self.stopping = False
-        self.failure = None
+        self.failure: Exception | None = None
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._stop)
         try:
             rclpy.init(args=list(ros_args), signal_handler_options=SignalHandlerOptions.NO)
-        except Exception as error:  # noqa: BLE001 - rcl's errors have no common class
-            raise RosError(_first_line(error)) from None
-        self.executor = EventsExecutor()
+        except Exception as error:  # noqa: BLE001 - the errors of rcl have no common class
+            raise RosError(one_line(error)) from None
+        self.executor: Any = EventsExecutor()
 
-    def _stop(self, _number, _frame):
+    def _stop(self, _number: int, _frame: object) -> None:
         self.stopping = True
 
-    def guard(self, callback):
-        """Wrap a callback: an exception that leaves one would print FATAL and a traceback."""
-        def guarded(*args):
+    def guard(self, callback: Callable[..., Any]) -> Callable[..., Any]:
+        """
+        Return a callback that keeps an exception in `failure`.
+
+        An exception that leaves a callback makes rclpy print FATAL and a traceback. A guarded
+        service callback returns its response unchanged then.
+        """
+        def guarded(*args: Any) -> Any:
             try:
                 return callback(*args)
-            except Exception as error:  # noqa: BLE001 - whatever it is, the node must end cleanly
+            except Exception as error:  # noqa: BLE001 - the node must end cleanly after any error
                 self.failure = self.failure or error
                 return args[1] if len(args) > 1 else None
         return guarded
 
-    def spin(self, work=None, real_time=False):
+    def spin_once(self, timeout: float = SPIN_TIMEOUT) -> None:
         """
-        Run callbacks until a signal or a failure; raises the failure.
+        Run the next callback.
 
-        :param work: called again and again instead, by a node that lets ROS have its turn itself.
-        :param real_time: ask for real-time priority.
+        :param timeout: longest wait for it [s].
         """
-        # What lives until the end need not be searched for garbage: with all that numba and
-        # matplotlib leave behind, one full search takes longer than several ticks.
-        gc.collect()
-        gc.freeze()
+        self.executor.spin_once(timeout_sec=timeout)
+
+    def spin(self, run_once: Callable[[], None], real_time: bool) -> None:
+        """
+        Call a function until a signal arrives or a callback fails.
+
+        :param run_once: returns within a fraction of a second.
+        :param real_time: ask for real-time priority.
+        :raises Exception: the failure of a guarded callback.
+        """
+        exempt_from_garbage_collection()
         if real_time:
-            go_first()
+            raise_priority()
         while not self.stopping and self.failure is None:
-            if work is None:
-                self.executor.spin_once(timeout_sec=SPIN_TIMEOUT)
-            else:
-                work()
+            run_once()
         if self.failure is not None:
             raise self.failure
 
-    def shut_down(self, node=None):
+    def shut_down(self, node: Node | None = None) -> None:
         """
-        End ROS in this process, and a node first.
+        Destroy executor, node and context, in this order.
 
-        The executor before it, which holds what the node is made of: a participant of Fast DDS
-        that is left to the end of the process may wait there for its own callbacks, for ever.
+        The executor holds references to the parts of the node. A participant of Fast DDS that
+        lives until the end of the process may wait there for its own callbacks for ever.
         """
         self.executor.shutdown()
         if node is not None:
             node.destroy_node()
-        rclpy.try_shutdown()
+        try_shutdown()
 
 
-def run_node(make_node, name, description, argv):
+def exempt_from_garbage_collection() -> None:
     """
-    Run one node until a signal.
+    Exempt all present objects from garbage collection.
 
-    :param make_node: called with the runtime, returns a node with a `close()`, and with a `work()`
-        where it does not live on callbacks, and `simulated` where its time is, whatever its
-        parameter use_sim_time says.
-    :param argv: what follows the executable's name.
-    :returns: exit code.
-    :raises RosError: bad arguments or no usable ROS.
+    With the objects of numba and matplotlib one full collection takes longer than several ticks.
     """
-    argv = list(argv)
-    parser = argparse.ArgumentParser(
-        prog=f'fourbar {name}', description=description, usage=f'fourbar {name} [--ros-args ...]',
-        epilog='Parameters (-p name:=value, --params-file FILE), remapping (-r) and namespace '
-               '(-r __ns:=/lab) follow --ros-args. docs/topics.md lists topics and parameters, '
-               'with units.')
-    try:
-        ros_free = remove_ros_args(args=[name, *argv])[1:]
-    except Exception as error:  # noqa: BLE001 - rcl's errors have no common class
-        raise RosError(_first_line(error)) from None
-    parser.parse_args(ros_free)
-    runtime = Runtime(argv)
-    node = None
-    try:
-        # Every kernel is compiled while the node is made, none while it runs.
-        with announced():
-            node = make_node(runtime)
-        runtime.executor.add_node(node)
-        # Simulated time waits; nodes that go as fast as they can would leave others no processor.
-        simulated = getattr(node, 'simulated', node.get_parameter('use_sim_time').value)
-        runtime.spin(getattr(node, 'work', None), real_time=not simulated)
-    except (InvalidNamespaceException, InvalidNodeNameException, InvalidTopicNameException,
-            ParameterException) as error:
-        raise RosError(_first_line(error)) from None
-    finally:
-        if node is not None:
-            node.close()
-            deliver(node.publishers)
-        runtime.shut_down(node)
-    return 0
+    gc.collect()
+    gc.freeze()
 
 
-def deliver(publishers):
+def flush(publishers: Iterable[Publisher]) -> None:
     """
-    Wait until every reliable subscriber has what was published, the last zero torque above all.
+    Wait until the reliable subscribers have acknowledged all messages, at most FLUSH_TIMEOUT.
 
-    What is still under way when its publisher ends is lost.
+    A message that is still on its way when its publisher is destroyed is lost; the last zero
+    torque must not be.
     """
-    end = time.monotonic() + LAST_WORDS
+    end = time.monotonic() + FLUSH_TIMEOUT
     for publisher in publishers:
         publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
 
 
-def _first_line(error):
+def one_line(error: BaseException) -> str:
+    """Return the message of an error in one line."""
     return ' '.join(str(error).split()) or type(error).__name__

@@ -9,7 +9,7 @@ from fourbar_ros.cli.demo import _one_move, _write_parameters
 from fourbar_ros.common.config_files import share_directory
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.loop import load_scenario
-from fourbar_ros.ros.tables import TABLES
+from fourbar_ros.ros.parameters import TABLES
 import pytest
 import yaml
 

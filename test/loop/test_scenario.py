@@ -16,7 +16,7 @@ from fourbar_ros.loop import load_scenario, Scenario, ScenarioError
 from fourbar_ros.loop.description import describe, load_description
 from fourbar_ros.loop.scenario import ALLOWED, scenario_from
 from fourbar_ros.mechanism import assemble
-from fourbar_ros.ros.tables import TABLES
+from fourbar_ros.ros.parameters import TABLES
 import numpy as np
 import pytest
 import yaml

@@ -96,7 +96,8 @@ def _serve():
     """Fork whenever asked to, and return in the child, with its arguments."""
     from fourbar_ros.cli import main  # noqa: F401
     from fourbar_ros.loop.warm_up import warm_up
-    from fourbar_ros.ros import controller, estimator, plant, recorder  # noqa: F401
+    from fourbar_ros.operator import recorder  # noqa: F401
+    from fourbar_ros.ros import controller, estimator, plant  # noqa: F401
     warm_up()
     # Else every child would copy all that, in order to search it for garbage at its end.
     gc.collect()

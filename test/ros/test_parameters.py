@@ -4,7 +4,7 @@
 """Parameters: declared as the tables say, checked at start and at run time."""
 
 from fourbar_ros.common.config_files import share_directory
-from fourbar_ros.ros.tables import TABLES, yaml_text
+from fourbar_ros.ros.parameters import TABLES, yaml_text
 import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -31,11 +31,11 @@ BUS = ('bus.interface', 'bus.channel', 'bus.options')
 ROWS = [(node, row) for node, table in TABLES.items() for row in table]
 each_node = pytest.mark.parametrize('node', list(TABLES))
 
-# By node: a bad value on the command line, and a word of the one line that is said.
+# By node: a refused argument, and a name or value in the one line of the message.
 BAD_AT_START = [
     ('plant', ['-p', 'rate:=nan'], 'rate'),
-    ('plant', ['-p', 'rate:=0.0'], 'between 1 and 2000'),
-    ('plant', ['-p', 'rate:=fast'], 'float'),
+    ('plant', ['-p', 'rate:=0.0'], '2000'),
+    ('plant', ['-p', 'rate:=fast'], 'rate'),
     ('plant', ['-p', 'seed:=1.5'], 'seed'),
     ('plant', ['-p', 'seed:=-1'], 'seed'),
     ('plant', ['-p', 'clock:=sundial'], 'realtime'),
@@ -124,11 +124,36 @@ def test_parameters_are_described_with_their_units(testbed, node):
     descriptors = testbed.call(
         DescribeParameters, f'{full_name(node)}/describe_parameters',
         DescribeParameters.Request(names=list(rows))).descriptors
+    assert [descriptor.name for descriptor in descriptors] == list(rows)
     for descriptor in descriptors:
         row = rows[descriptor.name]
         assert row.meaning in descriptor.description
         assert row.unit in descriptor.description
         assert (row.name, descriptor.read_only) == (row.name, not row.live)
+
+
+@each_node
+def test_parameters_are_described_with_their_ranges(testbed, node):
+    rows = {row.name: row for row in TABLES[node]}
+    descriptors = testbed.call(
+        DescribeParameters, f'{full_name(node)}/describe_parameters',
+        DescribeParameters.Request(names=list(rows))).descriptors
+    found = {descriptor.name: (
+        [(limits.from_value, limits.to_value) for limits in descriptor.floating_point_range],
+        [(limits.from_value, limits.to_value) for limits in descriptor.integer_range])
+        for descriptor in descriptors}
+    assert found == {
+        row.name: ([row.limits] if row.limits and row.kind is float else [],
+                   [row.limits] if row.limits and row.kind is int else [])
+        for row in rows.values()}
+
+
+def test_choices_are_described(testbed):
+    descriptor, = testbed.call(
+        DescribeParameters, 'plant/describe_parameters',
+        DescribeParameters.Request(names=['timeout_action'])).descriptors
+    for choice in ('coast', 'hold_speed', 'brake'):
+        assert choice in descriptor.additional_constraints
 
 
 @pytest.mark.parametrize(
@@ -149,7 +174,9 @@ def test_bad_value_is_refused_at_run_time(testbed, value):
     before = values_in(testbed, 'controller', ['bandwidth'])
     accepted, reason = set_value(testbed, 'controller', 'bandwidth', value)
     assert not accepted
+    # The message of the package and not that of rclpy, which names no unit.
     assert 'bandwidth' in reason
+    assert type(value) is not float or 'rad/s' in reason
     assert values_in(testbed, 'controller', ['bandwidth']) == before
 
 
