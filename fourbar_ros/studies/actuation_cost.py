@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a motion costs by how the wheels share it.
+Actuation cost of a motion for a given allocation of the torque to the wheels.
 
-Wheel energy of paper eq. 7, the sum of eq. 9 as it is printed, the work that motors do, and the
-heat in their windings; along a planned way, by inverse dynamics, with the friction of a table or
-without.
+Wheel energy of paper eq. 7, the sum of eq. 9 as printed, the work of the motors and the heat in
+their windings, by inverse dynamics along a reference trajectory, with or without friction.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.control.branch import branch_at, LINKS_ALONE
 from fourbar_ros.control.feasibility import wheel_loads
 from fourbar_ros.control.setpoint import angles_along
-from fourbar_ros.control.soft_step import TrajectorySegment
+from fourbar_ros.control.soft_step import SoftStep, TrajectorySegment
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix
@@ -32,29 +31,29 @@ from fourbar_ros.plant.table import surroundings_of
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-# Instants at which a way is looked at. Sums by the trapezoid are good to 1e-8 of their size.
+# Instants along a trajectory. The error of the trapezoidal sums is below 1e-8, relative.
 SAMPLES = 4001
 
-# Of the largest demand, what wheels may leave unmet.
+# Largest share of the demanded torque that the wheels may leave unmet; covers rounding.
 UNMET = 1e-9
 
 
-class SpendingError(FourbarError):
-    """A motion that the wheels cannot make."""
+class ActuationCostError(FourbarError):
+    """A motion for which the wheels cannot provide the torque."""
 
 
 @dataclass(frozen=True, eq=False)
-class Spending:
+class ActuationCost:
     """
-    Wheels along a motion.
+    Wheel torques and speeds along a motion, and the cost that follows from them.
 
     :param mechanism: the linkage.
     :param times: (n,) [s].
     :param angles: (n, 4) of the links [rad].
     :param link_rates: (n, 4) [rad/s].
-    :param torques: (n, 4) that motors and bearings give the wheels together [N m].
+    :param torques: (n, 4) of motors and bearings together on the wheels [N m].
     :param speeds: (n, 4) of the wheels, absolute [rad/s].
-    :param bearings: (n, 4) friction of the bearings, which the motors overcome [N m].
+    :param bearings: (n, 4) bearing friction that the motors overcome [N m].
     """
 
     mechanism: Mechanism
@@ -68,91 +67,132 @@ class Spending:
     @cached_property
     def energy(self) -> Array:
         """Kinetic energy of the wheels, paper eq. 7 (n,) [J]."""
-        found: Array = 0.5 * (self.speeds ** 2) @ self.mechanism.flywheel_inertias
-        return found
+        return _energy(self.speeds, self.mechanism)
 
     @cached_property
     def eq9(self) -> Array:
-        """Paper eq. 9 as printed, the integral of twice the kinetic energy (n,) [J s]."""
-        return self._summed(2.0 * self.energy)
+        """Paper eq. 9 as printed: the integral of twice the kinetic energy (n,) [J s]."""
+        return self._integral(2.0 * self.energy)
 
     @cached_property
     def work(self) -> Array:
-        """Work of the motors so far, without regard to sign (n,) [J]."""
-        return self._summed(np.abs(self.motor_torques * self.motor_speeds).sum(axis=1))
+        """Absolute work of the motors up to each time (n,) [J]."""
+        return self._integral(np.abs(self.motor_powers).sum(axis=1))
 
     @cached_property
-    def copper(self) -> Array:
-        """Heat in the windings so far, 0 where none are described (n,) [J]."""
-        return self._summed((self.currents ** 2) @ self.mechanism.motor_resistances)
+    def copper_loss(self) -> Array:
+        """Heat in the windings up to each time, 0 without winding data (n,) [J]."""
+        return self._integral((self.currents ** 2) @ self.mechanism.motor_resistances)
 
     @cached_property
-    def drawn(self) -> Array:
-        """Energy taken from the supplies so far, what braking motors give back lost (n,) [J]."""
-        power = (self.motor_torques * self.motor_speeds
-                 + self.currents ** 2 * self.mechanism.motor_resistances)
-        return self._summed(np.maximum(power, 0.0).sum(axis=1))
+    def energy_drawn(self) -> Array:
+        """Energy drawn from the supplies without regeneration up to each time (n,) [J]."""
+        power = self.motor_powers + self.currents ** 2 * self.mechanism.motor_resistances
+        return self._integral(np.maximum(power, 0.0).sum(axis=1))
+
+    @cached_property
+    def balanced_speeds(self) -> Array:
+        """
+        Wheel speeds with the least energy for the momentum of each pair (n, 4) [rad/s].
+
+        For a parallelogram: the two wheels of a pair have equal speeds, whatever their inertias.
+        """
+        inertias = self.mechanism.flywheel_inertias
+        balanced = np.empty_like(self.speeds)
+        for pair in ([0, 2], [1, 3]):
+            momentum = self.speeds[:, pair] @ inertias[pair]
+            balanced[:, pair] = (momentum / inertias[pair].sum())[:, None]
+        return balanced
+
+    @property
+    def least_energy(self) -> Array:
+        """Least kinetic energy of wheels that produce the same motion (n,) [J]."""
+        return _energy(self.balanced_speeds, self.mechanism)
 
     @property
     def motor_torques(self) -> Array:
-        """Torques of the motors, bearings included (n, 4) [N m]."""
+        """Torques of the motors, bearing friction included (n, 4) [N m]."""
         return self.torques + self.bearings
-
-    @property
-    def currents(self) -> Array:
-        """Currents in the windings, 0 where none are described (n, 4) [A]."""
-        found: Array = self.motor_torques / self.mechanism.motor_torque_constants
-        return found
 
     @property
     def motor_speeds(self) -> Array:
         """Speeds of the wheels relative to their links (n, 4) [rad/s]."""
         return self.speeds - self.link_rates
 
+    @property
+    def motor_powers(self) -> Array:
+        """Mechanical power of the motors (n, 4) [W]."""
+        return self.motor_torques * self.motor_speeds
+
+    @property
+    def currents(self) -> Array:
+        """Currents in the windings, 0 without winding data (n, 4) [A]."""
+        currents: Array = self.motor_torques / self.mechanism.motor_torque_constants
+        return currents
+
     def totals(self) -> dict[str, Any]:
-        """Return the numbers that stand for the whole motion, for JSON."""
+        """Return the totals and peaks of the motion, for JSON."""
         return {
-            'peak_speed_rad_s': float(np.abs(self.speeds).max()),
-            'peak_motor_speed_rad_s': float(np.abs(self.motor_speeds).max()),
-            'peak_torque_n_m': float(np.abs(self.motor_torques).max()),
-            'peak_power_w': float(np.abs(self.motor_torques * self.motor_speeds).max()),
+            'peak_speed_rad_s': peak(self.speeds),
+            'peak_motor_speed_rad_s': peak(self.motor_speeds),
+            'peak_torque_n_m': peak(self.motor_torques),
+            'peak_power_w': peak(self.motor_powers),
             'peak_energy_j': float(self.energy.max()),
             'eq9_j_s': float(self.eq9[-1]), 'work_j': float(self.work[-1]),
-            'copper_j': float(self.copper[-1]), 'drawn_j': float(self.drawn[-1]),
+            'copper_j': float(self.copper_loss[-1]), 'drawn_j': float(self.energy_drawn[-1]),
             'peak_speeds_rad_s': np.abs(self.speeds).max(axis=0).tolist(),
             'end_speeds_rad_s': self.speeds[-1].tolist()}
 
-    def _summed(self, rates: Array) -> Array:
-        found: Array = cumulative_trapezoid(rates, self.times, initial=0.0)
-        return found
+    def _integral(self, rates: Array) -> Array:
+        integral: Array = cumulative_trapezoid(rates, self.times, initial=0.0)
+        return integral
 
 
-def spend(mechanism: Mechanism, way: TrajectorySegment, present: Array, mobilities: Array,
-          speeds: Array | None = None, table: Table | None = None, samples: int = SAMPLES
-          ) -> Spending:
+def peak(values: Array) -> float:
+    """Return the largest absolute value."""
+    return float(np.abs(values).max())
+
+
+def rest_to_rest(theta: float, turn: Array | tuple[float, float], duration: float) -> SoftStep:
     """
-    Work out what a motion takes.
+    Return the soft step of links a and b from rest at (0, theta) to rest.
 
-    :param present: (4,) link angles where it begins, which tell the branch [rad].
-    :param mobilities: V (4,): wheels share for the least sum of `tau_i^2 / V_i`, see
-        `control.allocation.mobilities`.
-    :param speeds: (4,) absolute speeds of the wheels at the begin, default 0 [rad/s].
-    :param table: whose friction and drag the wheels work against, default none.
-    :param samples: instants to look at.
-    :raises ClosureError: the loop cannot close on the way.
-    :raises SpendingError: the wheels that may be used cannot meet the demand.
+    :param turn: (2,) angles by which links a and b turn [rad].
     """
-    times = way.instants(samples)
-    states = way.sample(times)
+    start = np.zeros((3, 2))
+    start[0] = 0.0, theta
+    return SoftStep(start, start[0] + turn, duration)
+
+
+def actuation_cost(
+    mechanism: Mechanism, segment: TrajectorySegment, present: Array, weights_inv: Array,
+    speeds: Array | None = None, table: Table | None = None, samples: int = SAMPLES,
+) -> ActuationCost:
+    """
+    Compute wheel torques and speeds along a trajectory by inverse dynamics.
+
+    :param present: (4,) link angles at the start, which select the branch [rad].
+    :param weights_inv: (4,) inverse weights w of the allocation, which minimises the sum of
+        `tau_i^2 / w_i`.
+    :param speeds: (4,) absolute speeds of the wheels at the start, default 0 [rad/s].
+    :param table: its friction and drag act on the linkage, default none.
+    :param samples: number of instants.
+    :raises ClosureError: the loop cannot close along the trajectory.
+    :raises ActuationCostError: the permitted wheels cannot provide the torque.
+    """
+    times = segment.instants(samples)
+    states = segment.sample(times)
     branch = branch_at(mechanism, present)
     angles = angles_along(mechanism, states[:, 0], present, branch)
     twins = LINKS_ALONE if branch is None else branch.twins
     constants = np.array([mechanism.constants])
-    metric = np.asarray(mobilities, dtype=float)
+    metric = np.asarray(weights_inv, dtype=float)
     torques, gained, unmet = wheel_loads(
         times, angles, states[:, 1:], branch is not None, twins, metric, constants)
     if not unmet <= UNMET:
-        raise SpendingError(f'these wheels leave {100.0 * unmet:.3g} % of the torque unmet')
+        raise ActuationCostError(
+            f'the permitted wheels leave {100.0 * unmet:.3g} % of the demanded torque unmet '
+            f'(limit {100.0 * UNMET:g} %)', value=unmet, limit=UNMET)
     wheel_maps = np.zeros((len(times), 2, 4))
     if branch is not None:
         for axis in range(2):
@@ -161,7 +201,7 @@ def spend(mechanism: Mechanism, way: TrajectorySegment, present: Array, mobiliti
         wheel_maps[:, 0, 0] = wheel_maps[:, 1, 1] = 1.0
         wheel_maps[:, :, 2:] = [gamma_matrix(four, mechanism.link_lengths).T for four in angles]
     link_rates = np.einsum('nki,nk->ni', wheel_maps, states[:, 1])
-    # What a wheel gains is relative to its link.
+    # The gained speeds are relative to the links.
     absolute = gained + link_rates - link_rates[0] + (np.zeros(4) if speeds is None else speeds)
     bearings = np.zeros_like(torques)
     if table is not None:
@@ -174,20 +214,19 @@ def spend(mechanism: Mechanism, way: TrajectorySegment, present: Array, mobiliti
         absolute += cumulative_trapezoid(against, times, axis=0, initial=0.0
                                          ) / mechanism.flywheel_inertias
         drives = drives_of(mechanism, table.wheel_bearings)
-        relative = absolute - link_rates
         bearings[:] = [[bearing_torque(speed, 0.0, drives) for speed in four]
-                       for four in relative.tolist()]
-    return Spending(mechanism, times, angles, link_rates, torques, absolute, bearings)
+                       for four in (absolute - link_rates).tolist()]
+    return ActuationCost(mechanism, times, angles, link_rates, torques, absolute, bearings)
 
 
-def fly(mechanism: Mechanism, state: Array, torques: Array, step: float) -> Array:
+def simulate_torques(mechanism: Mechanism, state: Array, torques: Array, step: float) -> Array:
     """
-    Let torques drive the linkage through the integrator, without friction.
+    Integrate the linkage under given wheel torques, without friction.
 
-    :param state: at the begin, see mechanism.layout; not changed.
-    :param torques: (2 m + 1, 4) on the wheels, at the begin, middle and end of m steps [N m].
+    :param state: initial state, see mechanism.state; not changed.
+    :param torques: (2 m + 1, 4) at the start, middle and end of m steps [N m].
     :param step: [s].
-    :returns: (m + 1, 4) link angles at the begin and after each step [rad].
+    :returns: (m + 1, 4) link angles at the start and after each step [rad].
     """
     state = state.copy()
     angles = [state[LINK_ANGLES].copy()]
@@ -196,3 +235,8 @@ def fly(mechanism: Mechanism, state: Array, torques: Array, step: float) -> Arra
                       mechanism.constants, NOTHING)
         angles.append(state[LINK_ANGLES].copy())
     return np.array(angles)
+
+
+def _energy(speeds: Array, mechanism: Mechanism) -> Array:
+    energy: Array = 0.5 * (speeds ** 2) @ mechanism.flywheel_inertias
+    return energy

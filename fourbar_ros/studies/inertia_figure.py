@@ -1,50 +1,49 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The figure of the study of wheel inertias: the front, what searches came to, and the paper's."""
+"""Figure of the inertia study: front, inertias of the searches, best motion, total inertia."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-import io
 from math import radians
 
 from fourbar_ros.plotting import style
 from fourbar_ros.plotting.style import COLOURS, LINK_COLOURS, LINK_DASHES
-from fourbar_ros.studies.inertia import Found, PAPER
-from fourbar_ros.studies.inertia_search import DURATION, least_at_error, TIMES
-from matplotlib import rc_context
+from fourbar_ros.studies.inertia_search import (
+    bound_at_error,
+    DURATION,
+    PAPER,
+    SearchResult,
+    TIMES,
+)
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 
-DPI = 120
+
+@style.as_png
+def png(results: Sequence[SearchResult], best: SearchResult) -> Figure:
+    """Draw front, inertias, the motions of the best wheels, and total inertia."""
+    figure, panels = style.panels(6.4, 2, 2)
+    by_kind = {kind: [result for result in results if result.kind == kind]
+               for kind in ('front', 'seeds', 'total', 'paper')}
+    _front(panels[0, 0], [*by_kind['front'], *by_kind['seeds']], by_kind['paper'])
+    _shares(panels[0, 1], by_kind['seeds'])
+    _motions(panels[1, 0], best)
+    _totals(panels[1, 1], by_kind['total'])
+    return figure
 
 
-def png(found: Sequence[Found], best: Found) -> bytes:
-    """Draw the front, the inertias, the motions of the best wheels, and total inertia."""
-    with rc_context(style.RC):
-        figure = Figure(figsize=(style.WIDTH_IN, 6.4), layout='constrained')
-        panels = figure.subplots(2, 2)
-        _front(panels[0, 0], found)
-        _shares(panels[0, 1], found)
-        _motions(panels[1, 0], best)
-        _totals(panels[1, 1], found)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format='png', dpi=DPI, facecolor=COLOURS['paper'])
-        return buffer.getvalue()
-
-
-def _front(axes: Axes, found: Sequence[Found]) -> None:
+def _front(axes: Axes, front: Sequence[SearchResult], paper: Sequence[SearchResult]) -> None:
     errors = np.geomspace(1e-3, 20.0, 80)
-    axes.plot(errors, [least_at_error(radians(error)) for error in errors],
+    axes.plot(errors, [bound_at_error(radians(error)) for error in errors],
               color=COLOURS['ink'], label='least possible at this error')
-    front = [each for each in found if each.kind in ('front', 'seeds')]
-    axes.plot([each.error for each in front], [each.ratio for each in front], 'o',
-              color=COLOURS['link_a'], markersize=4.5, label='CMA-ES')
-    paper = [each for each in found if each.kind == 'paper']
-    axes.plot([each.error for each in paper], [each.ratio for each in paper], 's',
-              color=COLOURS['limit'], markersize=5.5, label="CMA-ES, the paper's inertias")
+    for results, marker, colour, size, label in (
+            (front, 'o', 'link_a', 4.5, 'CMA-ES'),
+            (paper, 's', 'limit', 5.5, "CMA-ES, the paper's inertias")):
+        axes.plot([result.error for result in results], [result.ratio for result in results],
+                  marker, color=COLOURS[colour], markersize=size, label=label)
     axes.axhline(1.0, color=COLOURS['muted'], linewidth=0.8, linestyle=(0, (4, 3)))
     axes.set(xscale='log', xlabel='tracking error, rms [deg]',
              ylabel='eq. 9 / closed form at zero error', ylim=(0.4, 1.2))
@@ -52,11 +51,10 @@ def _front(axes: Axes, found: Sequence[Found]) -> None:
     axes.legend(loc='lower left')
 
 
-def _shares(axes: Axes, found: Sequence[Found]) -> None:
-    rows = [each for each in found if each.kind == 'seeds']
-    inertias = np.array([*(each.candidate.inertias for each in rows), PAPER])
-    labels = [*(f'seed {each.search.seed}' for each in rows), 'paper']
-    # One bar for each pair: how it is shared does not matter, its length does.
+def _shares(axes: Axes, seeds: Sequence[SearchResult]) -> None:
+    inertias = np.array([*(result.candidate.inertias for result in seeds), PAPER])
+    labels = [*(f'seed {result.search.seed}' for result in seeds), 'paper']
+    # One bar for each pair: its length matters, its division does not.
     places = np.arange(len(labels))
     for pair, side in (((0, 2), 1.0), ((1, 3), -1.0)):
         left = np.zeros(len(labels))
@@ -75,7 +73,7 @@ def _shares(axes: Axes, found: Sequence[Found]) -> None:
     axes.legend(loc='center left', fontsize=8.0)
 
 
-def _motions(axes: Axes, best: Found) -> None:
+def _motions(axes: Axes, best: SearchResult) -> None:
     for wheel, speeds in enumerate(best.candidate.speeds):
         axes.plot(DURATION * TIMES, speeds, color=LINK_COLOURS[wheel],
                   linestyle=LINK_DASHES[wheel], linewidth=2.4 - 0.4 * wheel,
@@ -85,13 +83,13 @@ def _motions(axes: Axes, best: Found) -> None:
     axes.legend(loc='upper right')
 
 
-def _totals(axes: Axes, found: Sequence[Found]) -> None:
+def _totals(axes: Axes, results: Sequence[SearchResult]) -> None:
     totals = np.geomspace(0.4, 2.5, 50)
-    rows = [each for each in found if each.kind == 'total']
-    least = least_at_error(float(np.median([each.candidate.error_rms for each in rows])))
+    least = bound_at_error(float(np.median([each.candidate.error_rms for each in results])))
     axes.plot(totals, least / totals, color=COLOURS['ink'], label='least possible')
-    axes.plot([each.candidate.total for each in rows], [each.candidate.eq9 for each in rows], 'o',
-              color=COLOURS['link_a'], markersize=4.5, label='CMA-ES, total inertia free')
+    axes.plot([each.candidate.total for each in results],
+              [each.candidate.eq9 for each in results], 'o', color=COLOURS['link_a'],
+              markersize=4.5, label='CMA-ES, total inertia free')
     paper = sum(PAPER) / 4.0
     axes.plot(paper, 1.0 / (PAPER[0] + PAPER[2]) + 1.0 / (PAPER[1] + PAPER[3]), 's',
               color=COLOURS['limit'], markersize=5.5, label="the paper's inertias at their best")

@@ -4,18 +4,20 @@
 """
 Search for wheel inertias and wheel motions at once, as the paper does for its Fig. 5.
 
-The whole parallelogram shall follow a soft step. Minimised is the sum of eq. 9 over its least (the
-closed form at zero tracking error), of the mean square tracking error, and of the wheels' total
-inertia, the last two with weights. Wheel speeds are polynomials that begin and end at rest.
+The whole parallelogram follows a soft step. The search minimises the sum of eq. 9 over its least
+value (the closed form at zero tracking error), the weighted mean square tracking error, and the
+weighted total inertia of the wheels. Wheel speeds are polynomials that start and end at rest.
 
-How little eq. 9 may be at a tracking error is known: with both pairs alike it is the minimum of
-`int phi'^2 dt + mu int (phi - r)^2 dt`, a linear equation. No search can come below that.
+Eq. 9 has a lower bound at a given tracking error: with equal pairs it is the minimum of
+`int phi'^2 dt + mu int (phi - r)^2 dt`, the solution of a linear equation.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import cosh, exp, pi, radians, sinh, sqrt
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from math import cosh, degrees, exp, pi, radians, sinh, sqrt
+from typing import Any
 
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
@@ -25,16 +27,18 @@ from scipy.optimize import brentq
 from scipy.special import eval_jacobi
 
 TURN, DURATION = pi / 2.0, 10.0
-# Tracking errors count in this unit [rad].
+# Inertias that the paper reports for its search, relative to the nominal wheel.
+PAPER = (0.88, 0.41, 1.37, 0.77)
+# Unit of the tracking error in the cost [rad].
 ERROR_UNIT = radians(0.1)
 
-# Each wheel's speed is 30 s^2 (1 - s)^2 times a polynomial of so many terms.
+# The speed of a wheel is 30 s^2 (1 - s)^2 times a polynomial with this number of terms.
 TERMS = 8
 SAMPLES = 201
 VARIABLES = 5 + 4 * TERMS
-"""One for the total inertia, four for how it is shared, and the polynomials."""
+"""One variable for the total inertia, four for its distribution, and the polynomials."""
 
-# Where a search begins: shares and polynomials this far off, in the units of the variables.
+# Standard deviation of the initial distribution, in the units of the variables.
 SPREAD = 0.3
 GENERATIONS, POPULATION = 1500, 20
 
@@ -47,13 +51,13 @@ SQUARED_RATE = 10.0 / 7.0
 @dataclass(frozen=True)
 class Search:
     """
-    One search.
+    Settings of one search.
 
     :param error_weight: of the mean square tracking error, in `ERROR_UNIT` squared.
-    :param seed: of where it begins and of what it draws.
-    :param inertia_weight: of the total inertia, in that of four wheels; None to keep it there.
-    :param inertias: (4,) of the wheels where only their motions are searched for, in units of a
-        nominal wheel.
+    :param seed: of the start and of all random numbers.
+    :param inertia_weight: of the total inertia, relative to four nominal wheels; None: the total
+        stays that of four nominal wheels.
+    :param inertias: (4,) fixed inertias relative to a nominal wheel; None: they are variables.
     """
 
     error_weight: float
@@ -67,8 +71,8 @@ class Candidate:
     """
     Wheels and their motions.
 
-    :param inertias: (4,) in units of a nominal wheel.
-    :param coefficients: (4, TERMS) of the speeds, 1 for that of a nominal wheel of four.
+    :param inertias: (4,) relative to a nominal wheel.
+    :param coefficients: (4, TERMS) of the speeds; 1 is the speed of four nominal wheels.
     """
 
     inertias: Array
@@ -77,22 +81,17 @@ class Candidate:
     @property
     def speeds(self) -> Array:
         """Speeds (4, SAMPLES), in units of turn / duration times links over wheel inertia."""
-        found: Array = self.coefficients @ BASIS
-        return found
+        return _product(self.coefficients, BASIS)
 
     @property
     def rates(self) -> Array:
         """Rates of the pairs ac and bd (2, SAMPLES), in turn / duration."""
-        momenta = self.inertias[:, None] * self.speeds
-        found: Array = 0.5 * (momenta[:2] + momenta[2:])
-        return found
+        return self._of_pairs(BASIS)
 
     @property
     def errors(self) -> Array:
         """Tracking errors of the pairs (2, SAMPLES) [rad]."""
-        momenta = self.inertias[:, None] * (self.coefficients @ INTEGRALS)
-        found: Array = TURN * (0.5 * (momenta[:2] + momenta[2:]) - REFERENCE)
-        return found
+        return TURN * (self._of_pairs(INTEGRALS) - REFERENCE)
 
     @property
     def error_rms(self) -> float:
@@ -101,28 +100,81 @@ class Candidate:
 
     @property
     def eq9(self) -> float:
-        """Eq. 9 over the least of four nominal wheels at zero tracking error."""
+        """Eq. 9 over the least value of four nominal wheels at zero tracking error."""
         return _eq9(self.inertias, self.speeds)
 
     @property
     def total(self) -> float:
-        """Inertia of all wheels over that of four nominal ones."""
+        """Inertia of all wheels relative to four nominal wheels."""
         return float(self.inertias.sum()) / 4.0
 
     @property
     def eq9_without_error(self) -> float:
-        """Eq. 9 likewise, of the same wheels if the pairs are made to follow exactly."""
+        """Eq. 9 likewise, of the same wheels with speeds corrected to zero tracking error."""
         missing = BASIS[0] - self.rates
         inertias = np.tile(self.inertias[:2] + self.inertias[2:], 2)[:, None]
         return _eq9(self.inertias, self.speeds + np.tile(2.0 * missing, (2, 1)) / inertias)
 
+    def _of_pairs(self, terms: Array) -> Array:
+        """Return the mean of the momenta of each pair, or of their integrals."""
+        momenta = self.inertias[:, None] * (self.coefficients @ terms)
+        return _product(0.5, momenta[:2] + momenta[2:])
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """
+    Result of a search.
+
+    :param kind: `front`, `seeds`, `total` or `paper`.
+    :param search: its settings.
+    :param candidate: the best candidate.
+    :param evaluations: number of evaluated candidates.
+    """
+
+    kind: str
+    search: Search
+    candidate: Candidate
+    evaluations: int
+
+    @property
+    def ratio(self) -> float:
+        """Eq. 9 over the closed form for wheels of the same total inertia."""
+        return self.candidate.eq9 * self.candidate.total
+
+    @property
+    def error(self) -> float:
+        """Tracking error, rms [deg]."""
+        return degrees(self.candidate.error_rms)
+
+    @cached_property
+    def over_bound(self) -> float:
+        """Eq. 9 over its lower bound at this error."""
+        return self.ratio / bound_at_error(self.candidate.error_rms)
+
+    @property
+    def ratio_without_error(self) -> float:
+        """Eq. 9 without tracking error over the closed form."""
+        return self.candidate.eq9_without_error * self.candidate.total
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as numbers and lists."""
+        return {
+            'kind': self.kind, **asdict(self.search), 'evaluations': self.evaluations,
+            'error_rms_deg': self.error, 'eq9_over_closed_form': self.ratio,
+            'eq9_over_least_at_error': self.over_bound,
+            'eq9_over_closed_form_without_error': self.ratio_without_error,
+            'eq9_over_four_nominal': self.candidate.eq9,
+            'total_inertia_over_nominal': self.candidate.total,
+            'inertias_over_nominal': self.candidate.inertias.tolist()}
+
 
 def decode(variables: Array) -> Candidate:
     """
-    Make a candidate of what is searched for, (VARIABLES,).
+    Return the candidate for the variables of the search (VARIABLES,).
 
-    The polynomials are those of the wheels' momenta, so that inertias do not change what the
-    links do; all zero are four nominal wheels.
+    The polynomials describe the momenta of the wheels, so that inertias do not change the motion
+    of the links. Zero is four nominal wheels.
     """
     shares = np.exp(variables[1:5])
     inertias = 4.0 * exp(variables[0]) * shares / shares.sum()
@@ -131,25 +183,19 @@ def decode(variables: Array) -> Candidate:
     return Candidate(inertias, momenta / inertias[:, None])
 
 
-def encoded(inertias: Array) -> list[float]:
-    """Return the variables that stand for wheel inertias (4,): the first five."""
-    total: list[float] = [float(np.log(inertias.sum() / 4.0)), *np.log(inertias).tolist()]
-    return total
-
-
 def cost(candidate: Candidate, search: Search) -> float:
-    """Evaluate what is minimised."""
+    """Evaluate the minimised cost."""
     value = candidate.eq9 + search.error_weight * (candidate.error_rms / ERROR_UNIT) ** 2
     if search.inertia_weight is not None:
         value += search.inertia_weight * candidate.total
     return value
 
 
-def find(search: Search) -> tuple[Array, int]:
+def run_search(search: Search) -> tuple[Array, int]:
     """
     Search by CMA-ES.
 
-    :returns: the best variables (VARIABLES,), and how many candidates were looked at.
+    :returns: the best variables (VARIABLES,) and the number of evaluated candidates.
     """
     import cma
 
@@ -159,39 +205,42 @@ def find(search: Search) -> tuple[Array, int]:
     if search.inertia_weight is None:
         begin[0], free[0] = 0.0, False
     if search.inertias is not None:
-        begin[:5], free[:5] = encoded(np.array(search.inertias)), False
+        inertias = np.array(search.inertias)
+        begin[:5] = [np.log(inertias.sum() / 4.0), *np.log(inertias)]
+        free[:5] = False
 
-    def whole(some: Array) -> Array:
+    def complete(values: Array) -> Array:
         variables: Array = begin.copy()
-        variables[free] = some
+        variables[free] = values
         return variables
 
     strategy = cma.CMAEvolutionStrategy(begin[free], SPREAD, {
         'popsize': POPULATION, 'maxiter': GENERATIONS, 'verbose': -9,
-        # Its own default draws from what all of numpy shares.
+        # The default generator is numpy's global one.
         'seed': np.nan, 'randn': lambda *shape: rng.standard_normal(shape),
         'tolfun': 1e-12, 'tolfunhist': 1e-13, 'tolx': 1e-10})
     while not strategy.stop():
-        asked = strategy.ask()
-        strategy.tell(asked, [cost(decode(whole(some)), search) for some in asked])
-    return whole(np.array(strategy.result.xbest)), int(strategy.result.evaluations)
+        population = strategy.ask()
+        strategy.tell(population, [cost(decode(complete(values)), search)
+                                   for values in population])
+    return complete(np.array(strategy.result.xbest)), int(strategy.result.evaluations)
 
 
-def least_at_weight(weight: float) -> tuple[float, float]:
+def bound_at_weight(weight: float) -> tuple[float, float]:
     """
-    Return what no search can beat, for a weight of the error.
+    Return error and eq. 9 at the minimum of the cost, for a weight of the error.
 
-    With phi = r + e, `e'' = mu e - r''`, e(0) = 0, e'(T) = 0; r'' is a cubic, so e is a polynomial
-    and an exponential. Times in durations, angles in turns.
+    With phi = r + e, `e'' = mu e - r''`, e(0) = 0, e'(T) = 0. r'' is a cubic, so that e is the sum
+    of a polynomial and exponentials. Times in durations, angles in turns.
 
     :returns: tracking error, rms [rad]; eq. 9 over the least of the same wheels at zero error.
     """
-    # weight e^2 / unit^2 beside int phi'^2 / SQUARED_RATE, e in turns.
+    # Cost: weight e^2 / unit^2 + int phi'^2 / SQUARED_RATE, e in turns.
     mu = weight * (TURN / ERROR_UNIT) ** 2 * SQUARED_RATE
     bend = SOFT_STEP.deriv(2)
     smooth = bend / mu + bend.deriv(2) / mu ** 2
     root = sqrt(mu)
-    # On [0, 1]: a sinh(root s) + b sinh(root (1 - s)), both over their largest value.
+    # On [0, 1]: a sinh(root s) + b sinh(root (1 - s)), each divided by sinh(root).
     s = np.linspace(0.0, 1.0, 20001)
     b = -smooth(0.0)
     slope_of_b = -root / sinh(root) if root < 300.0 else 0.0
@@ -205,36 +254,39 @@ def least_at_weight(weight: float) -> tuple[float, float]:
             float(trapezoid(rate ** 2, s)) / SQUARED_RATE)
 
 
-def least_at_error(error_rms: float) -> float:
+def bound_at_error(error_rms: float) -> float:
     """
-    Return eq. 9 that no search can beat at a tracking error, over the least at zero error.
+    Return the lower bound of eq. 9 at a tracking error, over the least value at zero error.
 
-    :param error_rms: [rad], less than that of standing still.
+    :param error_rms: [rad], less than the error of a linkage at rest.
     """
     if error_rms <= 0.0:
         return 1.0
     low, high = -25.0, 25.0
-    weight = brentq(lambda exponent: np.log(least_at_weight(exp(exponent))[0] / error_rms),
+    weight = brentq(lambda exponent: np.log(bound_at_weight(exp(exponent))[0] / error_rms),
                     low, high, xtol=1e-12)
-    return least_at_weight(exp(weight))[1]
+    return bound_at_weight(exp(weight))[1]
 
 
 def _sinh_share(root: float, s: Array) -> Array:
     """Evaluate sinh(root s) / sinh(root) for s in [0, 1]."""
-    found: Array = np.exp(root * (s - 1.0)) * -np.expm1(-2.0 * root * s) / -np.expm1(-2.0 * root)
-    return found
+    return (np.exp(root * (s - 1.0)) * -np.expm1(-2.0 * root * s)) / -float(
+        np.expm1(-2.0 * root))
 
 
 def _cosh_share(root: float, s: Array) -> Array:
     """Evaluate cosh(root s) / sinh(root) for s in [0, 1]."""
-    found: Array = (np.exp(root * (s - 1.0)) + np.exp(-root * (s + 1.0))) / -np.expm1(-2.0 * root)
-    return found
+    return (np.exp(root * (s - 1.0)) + np.exp(-root * (s + 1.0))) / -float(np.expm1(-2.0 * root))
+
+
+def _product(first: Any, second: Array) -> Array:
+    product: Array = np.dot(first, second)
+    return product
 
 
 def _mean(values: Array) -> Array:
     """Return the mean over time, along the last axis."""
-    found: Array = values @ WEIGHTS
-    return found
+    return _product(values, WEIGHTS)
 
 
 def _eq9(inertias: Array, speeds: Array) -> float:
@@ -242,14 +294,14 @@ def _eq9(inertias: Array, speeds: Array) -> float:
 
 
 def _polynomials() -> list[Polynomial]:
-    """Return the terms of the speeds over the share of the duration."""
-    window, found = SOFT_STEP.deriv(), []
+    """Return the terms of the speeds as functions of the share of the duration."""
+    window, terms = SOFT_STEP.deriv(), []
     for order in range(TERMS):
-        # Orthogonal under the square of the window: the search sees all of one size.
+        # Orthogonal under the square of the window: all variables have one scale.
         fitted = Polynomial.fit(TIMES, eval_jacobi(order, 4.0, 4.0, 2.0 * TIMES - 1.0), order)
         speed = window * fitted.convert()
-        found.append(speed / sqrt(float(_mean(speed(TIMES) ** 2)) / SQUARED_RATE))
-    return found
+        terms.append(speed / sqrt(float(_mean(speed(TIMES) ** 2)) / SQUARED_RATE))
+    return terms
 
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(SAMPLES)

@@ -9,7 +9,6 @@ import io
 from math import pi
 
 from fourbar_ros.control.allocation import mobilities
-from fourbar_ros.control.soft_step import SoftStep
 from fourbar_ros.mechanism import (
     angular_momentum,
     assemble,
@@ -17,15 +16,12 @@ from fourbar_ros.mechanism import (
     Mechanism,
     reduced_form,
 )
-from fourbar_ros.studies.actuation_cost import spend, SpendingError
-from fourbar_ros.studies.energy import (
-    balanced_speeds,
-    balancing,
-    flown,
-    least_energy,
-    run,
-    turn,
+from fourbar_ros.studies.actuation_cost import (
+    actuation_cost,
+    ActuationCostError,
+    rest_to_rest,
 )
+from fourbar_ros.studies.energy import balancing, integration_error, run, turn
 import numpy as np
 import pytest
 
@@ -41,13 +37,12 @@ ODD = Mechanism(
 
 
 def odd_step(speeds=None, law: str = 'min_norm'):
-    start = np.zeros((3, 2))
-    start[0] = 0.0, 1.2
-    return spend(ODD, SoftStep(start, np.array([0.9, 1.5]), 2.0), assemble(ODD, 0.0, 1.2),
-                 mobilities(law, ODD.flywheel_inertias, [True] * 4), speeds)
+    return actuation_cost(
+        ODD, rest_to_rest(1.2, (0.9, 0.3), 2.0), assemble(ODD, 0.0, 1.2),
+        mobilities(law, ODD.flywheel_inertias, [True] * 4), speeds)
 
 
-def test_study_keeps_its_checks_and_its_keys() -> None:
+def test_study_passes_its_checks_and_has_its_keys() -> None:
     result = run(lambda items, _: items)
     assert [check.name for check in result.checks if not check.passed] == []
     for law in ('two_wheels', 'four_wheels'):
@@ -65,61 +60,59 @@ def test_study_keeps_its_checks_and_its_keys() -> None:
 @pytest.mark.parametrize('law', ['two_wheels', 'min_norm', 'min_energy'])
 def test_torques_make_the_motion_of_any_linkage(law: str) -> None:
     """Through the integrator, which shares no line with the inverse dynamics."""
-    spending = odd_step(np.array([30.0, -20.0, 10.0, 0.0]), law)
-    assert flown(spending) < 1e-9
+    cost = odd_step(np.array([30.0, -20.0, 10.0, 0.0]), law)
+    assert integration_error(cost) < 1e-9
     total = [angular_momentum(ODD, *row) for row in zip(
-        spending.angles, spending.link_rates, spending.speeds)]
+        cost.angles, cost.link_rates, cost.speeds)]
     np.testing.assert_allclose(total, total[0], atol=1e-6 * np.ptp(
-        spending.speeds @ ODD.flywheel_inertias))
-    assert spending.motor_speeds[0] == pytest.approx([30.0, -20.0, 10.0, 0.0])
+        cost.speeds @ ODD.flywheel_inertias))
+    assert cost.motor_speeds[0] == pytest.approx([30.0, -20.0, 10.0, 0.0])
 
 
 def test_least_accelerations_are_those_of_the_pseudo_inverse() -> None:
     """Paper eq. 8, corrected: (G diag(If))^+ of the demand."""
-    spending = odd_step()
+    cost = odd_step()
     for n in (700, 2000, 3100):
-        form = reduced_form(ODD, spending.angles[n], spending.link_rates[n])
+        form = reduced_form(ODD, cost.angles[n], cost.link_rates[n])
         step = 1e-3
-        rates = np.array([np.interp(spending.times[n] + dt, spending.times, column)
-                          for column in spending.link_rates[:, :2].T for dt in (-step, step)])
+        rates = np.array([np.interp(cost.times[n] + dt, cost.times, column)
+                          for column in cost.link_rates[:, :2].T for dt in (-step, step)])
         demand = form.mass_matrix @ ((rates[1::2] - rates[::2]) / (2.0 * step)) + form.bias
         accelerations = -np.linalg.pinv(form.wheel_map * ODD.flywheel_inertias) @ demand
         np.testing.assert_allclose(
-            spending.torques[n], ODD.flywheel_inertias * accelerations,
-            atol=1e-4 * np.abs(spending.torques).max())
+            cost.torques[n], ODD.flywheel_inertias * accelerations,
+            atol=1e-4 * np.abs(cost.torques).max())
 
 
 def test_work_is_what_the_energy_gains_where_no_motor_brakes() -> None:
     """Until the fastest moment all motors push: work is the energy of wheels and links."""
-    spending = turn(PAPER, WHOLE, 'min_norm')
-    middle = len(spending.times) // 2
-    links = 0.5 * 2.0 * 1.44e-4 * spending.link_rates[middle, 0] ** 2
-    assert spending.work[middle] == pytest.approx(
-        spending.energy[middle] + links, rel=1e-6)
+    cost = turn(PAPER, WHOLE, 'min_norm')
+    middle = len(cost.times) // 2
+    links = 0.5 * 2.0 * 1.44e-4 * cost.link_rates[middle, 0] ** 2
+    assert cost.work[middle] == pytest.approx(
+        cost.energy[middle] + links, rel=1e-6)
 
 
 def test_nothing_is_below_the_least_and_balancing_reaches_it() -> None:
-    for spending in (turn(PAPER, WHOLE, 'two_wheels'), turn(UNEQUAL, WHOLE, 'min_norm'),
+    for cost in (turn(PAPER, WHOLE, 'two_wheels'), turn(UNEQUAL, WHOLE, 'min_norm'),
                      turn(PAPER, WHOLE, 'min_norm', np.array([50.0, 20.0, -10.0, 0.0]))):
-        assert (spending.energy >= least_energy(spending) * (1.0 - 1e-12)).all()
+        assert (cost.energy >= cost.least_energy * (1.0 - 1e-12)).all()
     unequal = turn(UNEQUAL, WHOLE, 'min_energy')
-    np.testing.assert_allclose(unequal.energy, least_energy(unequal), atol=1e-18)
+    np.testing.assert_allclose(unequal.energy, unequal.least_energy, atol=1e-18)
     kept = turn(UNEQUAL, WHOLE, 'min_energy', np.array([50.0, 20.0, -10.0, 0.0]))
-    spending = balancing(kept)
-    assert flown(spending) < 1e-9
-    np.testing.assert_allclose(spending.speeds[-1], balanced_speeds(spending)[-1], atol=1e-2)
+    cost = balancing(kept)
+    assert integration_error(cost) < 1e-9
+    np.testing.assert_allclose(cost.speeds[-1], cost.balanced_speeds[-1], atol=1e-2)
     # What moves no link changes no momentum of a pair.
     for pair in ([0, 2], [1, 3]):
-        np.testing.assert_allclose(spending.speeds[:, pair] @ UNEQUAL.flywheel_inertias[pair],
+        np.testing.assert_allclose(cost.speeds[:, pair] @ UNEQUAL.flywheel_inertias[pair],
                                    kept.speeds[:, pair] @ UNEQUAL.flywheel_inertias[pair])
     np.testing.assert_allclose(
-        np.gradient(spending.speeds, spending.times, axis=0)[5:-5] * UNEQUAL.flywheel_inertias,
-        spending.torques[5:-5], atol=1e-4 * np.abs(spending.torques).max())
+        np.gradient(cost.speeds, cost.times, axis=0)[5:-5] * UNEQUAL.flywheel_inertias,
+        cost.torques[5:-5], atol=1e-4 * np.abs(cost.torques).max())
 
 
-def test_wheels_of_one_pair_cannot_turn_the_other() -> None:
-    start = np.zeros((3, 2))
-    start[0] = 0.0, 1.0
-    with pytest.raises(SpendingError, match='leave 100 % of the torque unmet'):
-        spend(PAPER, SoftStep(start, np.array([1.0, 2.0]), 5.0), assemble(PAPER, 0.0, 1.0),
-              np.array([1.0, 0.0, 1.0, 0.0]))
+def test_wheels_of_one_pair_cannot_turn_the_other(refuses) -> None:
+    with refuses(ActuationCostError, value=pytest.approx(1.0), limit=1e-9):
+        actuation_cost(PAPER, rest_to_rest(1.0, (1.0, 1.0), 5.0), assemble(PAPER, 0.0, 1.0),
+                       np.array([1.0, 0.0, 1.0, 0.0]))
