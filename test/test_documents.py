@@ -13,7 +13,7 @@ from typing import Any
 from fourbar_ros.cli.main import COMMANDS
 from fourbar_ros.common.config_files import config_file, load_yaml
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.hardware.safety_table import LEAST, load_safety
+from fourbar_ros.hardware.safety_table import CONDITIONS, load_safety
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism
 from fourbar_ros.plant.energy_budget import EnergyBudget
 from fourbar_ros.plant.fault_schedule import parse_schedule, read_schedule
@@ -172,8 +172,8 @@ def test_what_stops_the_prototype_is_told() -> None:
             *(float(re.findall('[0-9.]+', cell)[0]) if cell else 0.0 for cell in (limit, lasting)),
             re.split('[: ]', reaction)[0], least)
     table = load_safety('prototype')
-    expected = {row: (rule.limit, rule.lasting, rule.reaction.name.lower(),
-                      LEAST[row].name.lower()) for row, rule in table.items()}
+    expected = {row: (rule.limit, rule.lasting, rule.reaction,
+                      CONDITIONS[row].least.name.lower()) for row, rule in table.items()}
     # What only keeps it from being armed has no other consequence.
     limit, lasting, *_ = expected['wheel_speed_to_arm']
     expected['wheel_speed_to_arm'] = (limit, lasting, 'refuses', 'refuses')

@@ -8,15 +8,15 @@ The simulated table is not imported here (`fourbar_ros.device.simulated`), so th
 hardware loads no plant.
 """
 
-from fourbar_ros.device.arming import ArmingGate, DeviceState
+from fourbar_ros.device.arming import Arming, DeviceState
 from fourbar_ros.device.clock_modes import (
-    ClockLimit,
     ClockMode,
     ClockModeError,
     FastClock,
     LockstepClock,
     LockstepGuard,
     Participants,
+    RateLimit,
     RealtimeClock,
     Recovery,
 )
@@ -34,8 +34,8 @@ from fourbar_ros.device.interface import (
 from fourbar_ros.device.supervisor import DeviceSupervisor, SupervisorSettings, Timing
 
 __all__ = [
-    'ArmingGate', 'ClockLimit', 'ClockMode', 'ClockModeError', 'Device', 'DeviceFault',
-    'DeviceState', 'DeviceSupervisor', 'Drive', 'drive_by_name', 'FastClock', 'LinkSample',
-    'LockstepClock', 'LockstepGuard', 'Participants', 'Reaction', 'RealtimeClock', 'Recovery',
+    'Arming', 'ClockMode', 'ClockModeError', 'Device', 'DeviceFault', 'DeviceState',
+    'DeviceSupervisor', 'Drive', 'drive_by_name', 'FastClock', 'LinkSample', 'LockstepClock',
+    'LockstepGuard', 'Participants', 'RateLimit', 'Reaction', 'RealtimeClock', 'Recovery',
     'Samples', 'SupervisorSettings', 'Timing', 'TrueState', 'WheelSample',
 ]

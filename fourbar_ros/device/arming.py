@@ -18,7 +18,7 @@ class DeviceState(Enum):
     FAULT = 'fault'
 
 
-class ArmingGate:
+class Arming:
     """
     A small state machine with one way to drive wheels and many ways to stop.
 

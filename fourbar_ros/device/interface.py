@@ -182,7 +182,7 @@ class Device(Protocol):
         """
         return
 
-    def gate_changed(self, state: DeviceState) -> None:
+    def arming_changed(self, state: DeviceState) -> None:
         """Learn that the wheels may be driven now, or not any more, and why."""
         return
 
@@ -206,7 +206,7 @@ class Device(Protocol):
         """Tell what is not as it should be, by what it is about; nothing if all is well."""
         return {}
 
-    def facts(self) -> dict[str, object]:
+    def diagnostic_values(self) -> dict[str, object]:
         """Tell what a person wants to know when something is wrong, counters above all."""
         return {}
 

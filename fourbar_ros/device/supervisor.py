@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.named_values import RejectedError
 from fourbar_ros.common.settings import setting, Settings
-from fourbar_ros.device.arming import ArmingGate, DeviceState
+from fourbar_ros.device.arming import Arming, DeviceState
 from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.device.interface import Device, Drive, no_torque, Reaction, Samples
 from fourbar_ros.mechanism.constants import Array
@@ -83,7 +83,7 @@ class DeviceSupervisor:
 
     def __init__(self, device: Device, settings: SupervisorSettings) -> None:
         self.device = device
-        self.gate = ArmingGate()
+        self.arming = Arming()
         self.rejected: Counter[str] = Counter()
         self.clipped = 0
         self.last_rejection = ''
@@ -92,7 +92,7 @@ class DeviceSupervisor:
         self._parked: Drive | None = None
         self._wheel_speeds = np.zeros(4)
         self._seen_ns: dict[str, int] = {}
-        self._known_state = self.gate.state
+        self._known_state = self.arming.state
         self._stamp_ns = 0
         self._tick_ns: int | None = None
         # Ticks without an answer so far: when each went out, by stamp. Those that have waited for
@@ -169,7 +169,7 @@ class DeviceSupervisor:
         self._command_steady_ns = monotonic_ns
         self._answered(stamp_ns, monotonic_ns)
         self._drive = replace(drive, values=limited)
-        if self.gate.armed:
+        if self.arming.armed:
             self._tell_device()
 
     def arm(self, monotonic_ns: int, arming_blockers: Sequence[str]) -> tuple[bool, str]:
@@ -186,26 +186,26 @@ class DeviceSupervisor:
             arming_blockers = [*arming_blockers, f'no sample from {", ".join(silent)} for '
                                      f'{self._settings.sensor_timeout:g} s']
         arming_blockers = [*arming_blockers, *self.device.arming_blockers()]
-        was_armed = self.gate.armed
-        armed, message = self.gate.arm(self._now_ns, arming_blockers)
+        was_armed = self.arming.armed
+        armed, message = self.arming.arm(self._now_ns, arming_blockers)
         if armed and not was_armed:
             self._armed_steady_ns = monotonic_ns
             self._parked = None
             self._drive = no_torque()
-            self._gate_changed()
+            self._arming_changed()
         return armed, message
 
     def disarm(self, reason: str) -> None:
         """Stop driving: the wheels coast, without power."""
         parked, self._parked = self._parked is not None, None
-        self.gate.disarm(self._now_ns, reason, parked)
-        self._gate_changed()
+        self.arming.disarm(self._now_ns, reason, parked)
+        self._arming_changed()
 
     def emergency_stop(self, reason: str) -> None:
         """Stop driving until reset: the wheels coast, without power."""
         self._parked = None
-        self.gate.emergency_stop(self._now_ns, reason)
-        self._gate_changed()
+        self.arming.emergency_stop(self._now_ns, reason)
+        self._arming_changed()
 
     def reset(self) -> tuple[bool, str]:
         """
@@ -213,10 +213,10 @@ class DeviceSupervisor:
 
         The device may be stopped though the gate is not: by an earlier host, or by others.
         """
-        latched = self.gate.state in (DeviceState.EMERGENCY_STOP, DeviceState.FAULT)
-        answer = self.gate.reset(self._now_ns)
-        self._gate_changed()
-        if self.gate.state is not DeviceState.DISARMED:
+        latched = self.arming.state in (DeviceState.EMERGENCY_STOP, DeviceState.FAULT)
+        answer = self.arming.reset(self._now_ns)
+        self._arming_changed()
+        if self.arming.state is not DeviceState.DISARMED:
             return answer
         held = self.device.release()
         if held and not latched:
@@ -231,24 +231,24 @@ class DeviceSupervisor:
     def diagnostics(self) -> dict[str, object]:
         """Tell what a person wants to know when something is wrong."""
         return {
-            'state': self.gate.state.value, 'reason': self.gate.reason,
+            'state': self.arming.state.value, 'reason': self.arming.reason,
             'ticks_lost': self._lost, 'commands_clipped': self.clipped,
             'last_rejection': self.last_rejection,
             **{f'commands_rejected_{kind}': count
                for kind, count in sorted(self.rejected.items())},
-            **self.device.diagnostics(), **self.device.facts()}
+            **self.device.diagnostics(), **self.device.diagnostic_values()}
 
     @property
     def _now_ns(self) -> int:
         """Return the stamp of the last step of the device, 0 before the first [ns]."""
         return self._stamp_ns
 
-    def _gate_changed(self) -> None:
+    def _arming_changed(self) -> None:
         """Let the device know at once, if it does not yet."""
-        if self.gate.state is self._known_state:
+        if self.arming.state is self._known_state:
             return
-        self._known_state = self.gate.state
-        self.device.gate_changed(self.gate.state)
+        self._known_state = self.arming.state
+        self.device.arming_changed(self.arming.state)
         self._tell_device()
 
     def _tell_device(self) -> None:
@@ -259,8 +259,8 @@ class DeviceSupervisor:
 
     def _fail(self, stamp_ns: int, error: FourbarError) -> None:
         self._parked = None
-        self.gate.fail(stamp_ns, str(error))
-        self._known_state = self.gate.state
+        self.arming.fail(stamp_ns, str(error))
+        self._known_state = self.arming.state
 
     def _heed(self) -> None:
         """Do what the findings of the device lead to."""
@@ -306,20 +306,20 @@ class DeviceSupervisor:
             self._lost, self._step_ns * 1e-9)
 
     def _watch_commands(self, stamp_ns: int, monotonic_ns: int) -> None:
-        if not self.gate.armed:
+        if not self.arming.armed:
             return
         last_ns = max(self._armed_steady_ns, self._command_steady_ns or 0)
         if monotonic_ns - last_ns > self._settings.command_timeout * 1e9:
-            self.gate.disarm(
+            self.arming.disarm(
                 stamp_ns, f'no flywheel_command for {self._settings.command_timeout:g} s')
             if self._settings.timeout_action == 'hold_speed':
                 self._parked = _at_speeds(self._wheel_speeds)
             elif self._settings.timeout_action == 'brake':
                 self._parked = _at_speeds(np.zeros(4))
-            self._gate_changed()
+            self._arming_changed()
 
     def _present_drive(self) -> Drive:
-        if self.gate.armed:
+        if self.arming.armed:
             return self._drive
         return self._parked or no_torque()
 

@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A bus, whatever carries it: any interface that python-can knows, and one kind of error.
+A CAN bus through any interface of python-can, with one kind of error.
 
-python-can is imported only here, in `udp_bus` and in `serial_bus`, and not before a bus is opened.
+python-can is imported only in this module, in `udp_bus` and in `serial_bus`, and only when a bus
+is opened.
 """
 
 from __future__ import annotations
@@ -25,30 +26,31 @@ from fourbar_ros.hardware.messages import BusError, Frame
 if TYPE_CHECKING:
     import can
 
-# Named where somebody asks for one that there is not.
+# Examples in the message about an unknown interface.
 USUAL_INTERFACES = ('socketcan', 'fourbar_udp', 'slcan', 'pcan', 'kvaser', 'gs_usb', 'vector',
                     'ixxat', 'virtual')
 
-# Constructors that name every option they know, and let others pass.
-_TOLERANT = ('socketcan', 'slcan', 'gs_usb', 'serial', 'virtual')
+# Interfaces whose constructors name all options and ignore unknown ones without an error.
+_UNCHECKED_OPTIONS = ('socketcan', 'slcan', 'gs_usb', 'serial', 'virtual')
 
-_BESIDE = {'foreign': 'datagrams_foreign', 'malformed': 'datagrams_malformed',
-           'unreachable': 'datagrams_unreachable', 'garbled': 'bytes_garbled'}
+# Counters of our own buses, by attribute; the values are keys of diagnostics.
+_BUS_COUNTERS = {'foreign': 'datagrams_foreign', 'malformed': 'datagrams_malformed',
+                 'unreachable': 'datagrams_unreachable', 'garbled': 'bytes_garbled'}
 
-# These stamp frames with system time, so that it is known how long a frame waited to be read.
+# Interfaces that stamp received frames with system time, so that the wait in the receive buffer
+# is known.
 SYSTEM_TIME = ('socketcan', 'fourbar_udp')
-# Others may have clocks of their own: this far from system time it is one [s].
-OWN_CLOCK_S = 1.0
+MAX_FRAME_AGE_S = 1.0
+"""Larger differences to system time are taken for the adapter's own clock [s]."""
 
-# SocketCAN tells in the identifier of an error frame what is wrong (linux/can/error.h), and of
-# the controller in the second byte.
+# Error frames of SocketCAN (linux/can/error.h): bits of the identifier, and bits of the second
+# byte for the state `error passive`.
 _CONTROLLER, _BUS_OFF, _RESTARTED = 0x004, 0x040, 0x100
 _PASSIVE = 0x30
 
-# Why nobody takes what is sent, or what all error frames look like.
-_LOOK_AT = 'wiring, termination, bit rate, and whether the links have power'
+_CHECKLIST = 'wiring, termination, bit rate, and whether the links have power'
 _CAUSES = {
-    errno.ENOBUFS: f'the send buffer is full: check {_LOOK_AT}; or it is too short '
+    errno.ENOBUFS: f'the send buffer is full: check {_CHECKLIST}; or it is too short '
                    '(ip link set ... txqueuelen 1000)',
     errno.ENODEV: 'no such interface (`ip link` lists them)',
     errno.ENETDOWN: 'the interface is down (ip link set ... up type can bitrate ...)',
@@ -59,14 +61,14 @@ _CAUSES[errno.EAGAIN] = _CAUSES[errno.ENOBUFS]
 
 class Port:
     """
-    A bus that is open, and takes and gives classic frames with 11-bit identifiers.
+    An open bus for classic frames with 11-bit identifiers.
 
     :param bus: of python-can.
-    :param interface, channel: what it is called by.
-    :ivar name: interface and channel, to tell it by.
+    :param interface, channel: names of interface and channel.
+    :ivar name: interface and channel, for messages.
     :ivar sent, received: number of frames.
     :ivar errors: number of error frames.
-    :ivar dropped: number of frames that are extended or CAN FD.
+    :ivar dropped: number of extended and CAN FD frames.
     """
 
     def __init__(self, bus: can.BusABC, interface: str, channel: str) -> None:
@@ -75,10 +77,10 @@ class Port:
         self.sent = self.received = self.errors = self.dropped = 0
         self._bus: can.BusABC | None = bus
         self._message = can.Message
-        self._problems = (can.CanError, OSError, ValueError)
-        self._passive = {can.BusState.PASSIVE: 'error passive', can.BusState.ERROR: 'bus off'}
+        self._driver_errors = (can.CanError, OSError, ValueError)
+        self._bus_states = {can.BusState.PASSIVE: 'error passive', can.BusState.ERROR: 'bus off'}
         self._system_time = interface in SYSTEM_TIME
-        self._trouble: str | None = None
+        self._error_state: str | None = None
 
     def __enter__(self) -> Port:
         return self
@@ -88,19 +90,19 @@ class Port:
         self.close()
 
     @property
-    def trouble(self) -> str | None:
+    def fault(self) -> str | None:
         """
-        Tell what is wrong with the bus itself, as far as its interface knows.
+        Fault of the bus, as far as its interface reports one; None if there is none.
 
-        :returns: a few words; None if nothing is known. A wrong bit rate is seen here.
+        A wrong bit rate appears here, as error frames.
         """
-        state = self._trouble
+        state = self._error_state
         if self._bus is not None:
-            with suppress(NotImplementedError, *self._problems):
-                state = self._passive.get(self._bus.state, state)
+            with suppress(NotImplementedError, *self._driver_errors):
+                state = self._bus_states.get(self._bus.state, state)
         if state is None and self.errors:
             state = f'{self.errors} error frames'
-        return None if state is None else f'{state}: check {_LOOK_AT}'
+        return None if state is None else f'{state}: check {_CHECKLIST}'
 
     def send(self, frame: Frame) -> None:
         """
@@ -110,21 +112,21 @@ class Port:
         """
         frame_id, data, remote = frame
         try:
-            # A remote frame has the length of what it asks for; those of all that are asked for
-            # is 8.
+            # The length of a remote frame is that of the requested data: 8 in all our messages.
             self._open().send(self._message(
                 arbitration_id=frame_id, is_extended_id=False, is_remote_frame=remote,
                 dlc=8 if remote else None, data=data))
-        except self._problems as error:
-            raise BusError(f'{self.name}: cannot send: {_cause(error)}') from error
+        except self._driver_errors as error:
+            raise BusError(f'{self.name}: cannot send: {_cause(error)}', bus=self.name) from error
         self.sent += 1
 
     def receive(self, timeout_s: float) -> tuple[Frame, int] | None:
         """
         Wait for a frame.
 
-        :param timeout_s: for how long; 0 to take what is there.
-        :returns: the frame, and when it arrived on CLOCK_MONOTONIC_RAW [ns]; None if none did.
+        :param timeout_s: longest wait; 0: return at once.
+        :returns: the frame and its time of arrival on the monotonic clock [ns]; None at the
+            timeout.
         :raises BusError: the bus is off or down, the port is closed.
         """
         deadline = monotonic() + timeout_s if timeout_s > 0.0 else 0.0
@@ -132,71 +134,71 @@ class Port:
         while True:
             try:
                 message = self._open().recv(remaining_s)
-            except self._problems as error:
-                raise BusError(f'{self.name}: cannot receive: {_cause(error)}') from error
+            except self._driver_errors as error:
+                raise BusError(f'{self.name}: cannot receive: {_cause(error)}',
+                               bus=self.name) from error
             if message is None:
                 return None
             if not (message.is_error_frame or message.is_extended_id or message.is_fd):
                 break
             if message.is_error_frame:
-                self._take_error(message)
+                self._process_error(message)
             else:
                 self.dropped += 1
             if deadline:
                 remaining_s = max(0.0, deadline - monotonic())
         now_ns, age_s = monotonic_ns(), time() - message.timestamp
-        if age_s < 0.0 or age_s > OWN_CLOCK_S and not self._system_time:
+        if age_s < 0.0 or age_s > MAX_FRAME_AGE_S and not self._system_time:
             age_s = 0.0
         self.received += 1
         return Frame(message.arbitration_id, bytes(message.data), message.is_remote_frame), (
             now_ns - int(age_s * 1e9))
 
-    def facts(self) -> dict[str, object]:
-        """Tell what a person wants to know of the bus."""
-        told: dict[str, object] = {
+    def diagnostic_values(self) -> dict[str, object]:
+        """Return counters and the present fault, by name."""
+        values: dict[str, object] = {
             'bus_name': self.name, 'frames_sent': self.sent, 'frames_received': self.received,
             'frames_errors': self.errors, 'frames_dropped': self.dropped}
-        # What fourbar_udp and serial count beside.
-        for name, fact in _BESIDE.items():
-            if hasattr(self._bus, name):
-                told[fact] = getattr(self._bus, name)
-        if trouble := self.trouble:
-            told['bus_trouble'] = trouble
-        return told
+        values.update({key: getattr(self._bus, attribute) for attribute, key
+                       in _BUS_COUNTERS.items() if hasattr(self._bus, attribute)})
+        if fault := self.fault:
+            values['bus_trouble'] = fault
+        return values
 
     def close(self) -> None:
-        """Close the bus, if it is not yet."""
+        """Close the bus."""
         bus, self._bus = self._bus, None
         if bus is not None:
-            with suppress(*self._problems):
+            with suppress(*self._driver_errors):
                 bus.shutdown()
 
     def _open(self) -> can.BusABC:
         if self._bus is None:
-            raise BusError(f'{self.name} is closed')
+            raise BusError(f'{self.name} is closed', bus=self.name)
         return self._bus
 
-    def _take_error(self, message: can.Message) -> None:
+    def _process_error(self, message: can.Message) -> None:
         self.errors += 1
         kind = message.arbitration_id
         if kind & _BUS_OFF:
-            self._trouble = 'bus off'
-            raise BusError(f'{self.name}: {self.trouble}')
+            self._error_state = 'bus off'
+            raise BusError(f'{self.name}: {self.fault}')
         if kind & _RESTARTED:
-            self._trouble = None
+            self._error_state = None
         elif kind & _CONTROLLER and len(message.data) > 1:
-            self._trouble = 'error passive' if message.data[1] & _PASSIVE else None
+            self._error_state = 'error passive' if message.data[1] & _PASSIVE else None
 
 
 def open_port(interface: str, channel: str, bitrate: int = 0, options: str = '') -> Port:
     """
     Open a bus.
 
-    :param interface: as python-can calls it: `socketcan`, `fourbar_udp`, ...
-    :param channel: the same: `can0`, `/dev/ttyACM0`, `HOST:PORT`.
-    :param bitrate: [bit/s], 0 to leave it as it is; of SocketCAN it is the system that sets it.
-    :param options: what else the interface takes: `key=value key=value`.
-    :raises BusError: python-can is not installed; no such interface or channel; bad options.
+    :param interface: its name in python-can: `socketcan`, `fourbar_udp`, ...
+    :param channel: its name in python-can: `can0`, `/dev/ttyACM0`, `HOST:PORT`.
+    :param bitrate: [bit/s], 0 to leave it unchanged; on SocketCAN the system sets it.
+    :param options: further options of the interface: `key=value key=value`.
+    :raises BusError: python-can is not installed; no such interface or channel; bad options. Its
+        `values` have `bus`, and `option` for a bad option.
     """
     name = f'{interface} {channel}'
     settings = _settings(name, options)
@@ -205,28 +207,30 @@ def open_port(interface: str, channel: str, bitrate: int = 0, options: str = '')
     try:
         import can
     except ImportError as error:
-        raise BusError(f'{name}: python-can is missing: pip install fourbar_ros[hardware]'
-                       ) from error
-    _hush()
+        raise BusError(f'{name}: python-can is missing: pip install fourbar_ros[hardware]',
+                       bus=name) from error
+    _silence_logger()
     if interface not in can.VALID_INTERFACES:
-        raise BusError(f'{name}: no such interface (usual ones: {", ".join(USUAL_INTERFACES)})')
+        raise BusError(f'{name}: no such interface (usual ones: {", ".join(USUAL_INTERFACES)})',
+                       bus=name)
     try:
-        if interface in _TOLERANT:
-            kind = _kind(interface)
+        if interface in _UNCHECKED_OPTIONS:
+            kind = _bus_class(interface)
             _check_options(name, kind, settings)
             if interface == 'serial':
                 return Port(kind(channel, **settings), interface, channel)
-        # Nothing from the files that python-can keeps in the home of whoever runs this.
+        # Without the configuration files of python-can in the user's home.
         bus = can.Bus(channel, interface, ignore_config=True, **settings)
     except BusError:
         raise
     except (can.CanInterfaceNotImplementedError, ImportError, NameError) as error:
-        # Some drivers of python-can look for their library not before it is needed.
-        raise BusError(f'{name}: what it needs is not installed: {_cause(error)} (serial lines '
-                       'and multicast: pip install fourbar_ros[hardware])') from error
+        # Some drivers of python-can import their library only here.
+        raise BusError(f'{name}: a required package is not installed: {_cause(error)} (serial '
+                       'lines and multicast: pip install fourbar_ros[hardware])', bus=name
+                       ) from error
     except Exception as error:
-        # Drivers raise what they like.
-        raise BusError(f'{name}: {_cause(error)}') from error
+        # Drivers raise many kinds of errors.
+        raise BusError(f'{name}: {_cause(error)}', bus=name) from error
     return Port(bus, interface, channel)
 
 
@@ -234,22 +238,24 @@ def _settings(name: str, options: str) -> dict[str, Any]:
     settings: dict[str, Any] = {}
     for option in options.split():
         key, sign, text = option.partition('=')
+        problem = ''
         if not sign or not key.isidentifier() or not text:
-            raise BusError(f'{name}: option {option!r} must be key=value')
-        if key in ('interface', 'channel', 'bitrate'):
-            raise BusError(f'{name}: {key} is no option, it is given by itself')
-        if key in settings:
-            raise BusError(f'{name}: option {key} is given twice')
+            problem = f'option {option!r} must be key=value'
+        elif key in ('interface', 'channel', 'bitrate'):
+            problem = f'{key} is no option, it has a parameter of its own'
+        elif key in settings:
+            problem = f'option {key} is given twice'
+        if problem:
+            raise BusError(f'{name}: {problem}', bus=name, option=option)
         settings[key] = _value(text)
     return settings
 
 
-def _kind(interface: str) -> type[Any]:
-    """Return the class of a bus."""
+def _bus_class(interface: str) -> type[Any]:
     from can.interfaces import BACKENDS
     module, name = BACKENDS[interface]
     if interface == 'serial':
-        # The same bytes, but a line that is read as it shall be.
+        # Same format on the line, but with timeouts and resynchronization.
         module = 'fourbar_ros.hardware.serial_bus'
     kind: type[Any] = getattr(import_module(module), name)
     return kind
@@ -259,7 +265,8 @@ def _check_options(name: str, kind: type[Any], settings: dict[str, Any]) -> None
     known = signature(kind).parameters
     if unknown := sorted(set(settings) - set(known) - {'bitrate'}):
         options = sorted(set(known) - {'channel', 'bitrate', 'kwargs', 'can_filters'})
-        raise BusError(f'{name}: no option {", ".join(unknown)} (known are {", ".join(options)})')
+        raise BusError(f'{name}: no option {", ".join(unknown)} (known are {", ".join(options)})',
+                       bus=name, option=unknown[0], limit=options)
 
 
 def _value(text: str) -> str | int | float | bool:
@@ -273,7 +280,7 @@ def _value(text: str) -> str | int | float | bool:
 
 
 def _cause(error: BaseException) -> str:
-    """Return in one line what went wrong, and what to do about it where that is known."""
+    """Return the cause of an error in one line, with a remedy if one is known."""
     number = getattr(error, 'error_code', None) or getattr(error, 'errno', None)
     text = ' '.join((getattr(error, 'strerror', None) or str(error)).split())
     if 'buffer full' in text.lower():
@@ -281,8 +288,8 @@ def _cause(error: BaseException) -> str:
     return _CAUSES.get(number or 0, text or type(error).__name__)
 
 
-def _hush() -> None:
-    """Keep python-can from writing about what is told by an error, or is of no interest."""
+def _silence_logger() -> None:
+    """Keep python-can from logging what errors report already."""
     logger = logging.getLogger('can')
     if not any(isinstance(handler, logging.NullHandler) for handler in logger.handlers):
         logger.addHandler(logging.NullHandler())

@@ -1,57 +1,43 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the electronics of one link do: arming, limits, watchdog, faults."""
+"""Electronics of one emulated link: arming, limits, command timeout, faults."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Set
-from dataclasses import dataclass
 from math import copysign
 
 from fourbar_ros.hardware.messages import Command, COUNTERS, Limits, LinkState
 
-# A wheel beyond its speed limit by this factor is a fault of its own [1].
 OVERSPEED = 1.2
+"""Ratio of wheel speed to speed limit above which a link reports `overspeed`; the margin covers
+the overshoot of a speed controller at the limit."""
 
 
-@dataclass(frozen=True)
-class FirmwareSettings:
-    """
-    What a link does by itself.
-
-    :param command_timeout_s: longest time without a command while armed [s].
-    :param hottest: beyond this the motor gets no current [deg C].
-    :param lowest_voltage: below this likewise [V].
-    """
-
-    command_timeout_s: float = 0.1
-    hottest: float = 95.0
-    lowest_voltage: float = 9.5
+MAX_TEMPERATURE, MIN_VOLTAGE = 95.0, 9.5
+"""Limits at which a link cuts the power [deg C], [V]; beyond those of the host's safety rules, so
+that the host reacts first."""
 
 
 class Firmware:
     """
-    The electronics of a link, from its start on; times are of any steady clock [ns].
+    Electronics of a link since their start; times are of any monotonic clock [ns].
 
-    :ivar state: what it does.
-    :ivar faults: of `LINK_FAULTS`, as it tells them.
-    :ivar sequence: of the last command that was obeyed.
-    :ivar counts: of commands that were lost or not taken.
-    :ivar temperature, voltage: as it measures them [deg C], [V].
-    :ivar broken: faults that somebody made.
+    :param command_timeout_s: longest time without a command while armed [s].
+    :ivar state: present state.
+    :ivar sequence: of the last command that was carried out.
+    :ivar counts: number of lost, repeated and limited commands.
+    :ivar temperature, voltage: measured values [deg C], [V].
     """
 
-    def __init__(self, link: int, settings: FirmwareSettings) -> None:
-        self.link = link
+    def __init__(self, command_timeout_s: float) -> None:
         self.state = LinkState.IDLE
         self.sequence = 0
         self.counts: Counter[str] = Counter()
         self.temperature = 30.0
         self.voltage = 12.0
-        self.broken: Set[str] = frozenset()
-        self._settings = settings
+        self._timeout_ns = command_timeout_s * 1e9
         self._limits: Limits | None = None
         self._command: Command | None = None
         self._command_ns = 0
@@ -59,24 +45,19 @@ class Firmware:
 
     @property
     def faults(self) -> frozenset[str]:
-        """What is wrong with it."""
-        found = set(self.broken)
-        if self._limits is None:
-            found.add('no_limits')
-        if self._overspeed:
-            found.add('overspeed')
-        if self.temperature > self._settings.hottest:
-            found.add('overtemperature')
-        if self.voltage < self._settings.lowest_voltage:
-            found.add('undervoltage')
-        return frozenset(found)
+        """Present faults, of `LINK_FAULTS`."""
+        present = {
+            'no_limits': self._limits is None, 'overspeed': self._overspeed,
+            'overtemperature': self.temperature > MAX_TEMPERATURE,
+            'undervoltage': self.voltage < MIN_VOLTAGE}
+        return frozenset(fault for fault, is_present in present.items() if is_present)
 
     def load_limits(self, limits: Limits) -> None:
-        """Take limits over; without them it is never armed."""
+        """Accept limits; a link without limits cannot be armed."""
         self._limits = limits
 
     def stop(self) -> None:
-        """Cut the power until it is released."""
+        """Cut the power until `release`."""
         self.state = LinkState.STOPPED
 
     def release(self) -> None:
@@ -85,15 +66,15 @@ class Firmware:
             self.state = LinkState.IDLE
 
     def command(self, command: Command, now_ns: int) -> None:
-        """Take a command that is for this link, unless it came before."""
+        """Accept a command to this link, unless it is a repetition of an earlier one."""
         last = self._command
         if last is not None:
             ahead = (command.sequence - last.sequence) % COUNTERS
             if ahead == 0 or ahead > COUNTERS // 2:
-                # After a silence nobody knows how many were lost; but nothing that would drive a
-                # wheel begins a new count.
-                silent = now_ns - self._command_ns > self._settings.command_timeout_s * 1e9
-                if command.enable or not silent:
+                # After a timeout the number of lost commands is unknown, so any sequence is
+                # accepted, but only from a command without power.
+                timed_out = self._is_timed_out(now_ns)
+                if command.enable or not timed_out:
                     self.counts['replayed'] += 1
                     return
                 ahead = 1
@@ -107,9 +88,9 @@ class Firmware:
         elif self.state is LinkState.IDLE and not self.faults:
             self.state = LinkState.ARMED
 
-    def watch(self, speed: float, now_ns: int) -> None:
+    def monitor(self, speed: float, now_ns: int) -> None:
         """
-        Stop by itself where it must.
+        Check limits and command timeout.
 
         :param speed: of the wheel relative to the link [rad/s].
         """
@@ -119,11 +100,11 @@ class Firmware:
         if self.state is LinkState.ARMED:
             if self._stopping_faults():
                 self.state = LinkState.FAULT
-            elif now_ns - self._command_ns > self._settings.command_timeout_s * 1e9:
+            elif self._is_timed_out(now_ns):
                 self.state = LinkState.COASTING
 
     def drive(self) -> tuple[float, bool, bool]:
-        """Return what the motor is asked for, whether it is a speed, and whether it has power."""
+        """Return the input of the motor, whether it is a speed, and whether it has power."""
         command, limits = self._command, self._limits
         if self.state is not LinkState.ARMED or command is None or limits is None:
             return 0.0, False, False
@@ -133,6 +114,9 @@ class Firmware:
             value = copysign(limit, value)
             self.counts['clipped'] += 1
         return value, command.by_speed, True
+
+    def _is_timed_out(self, now_ns: int) -> bool:
+        return now_ns - self._command_ns > self._timeout_ns
 
     def _stopping_faults(self) -> frozenset[str]:
         return self.faults - {'no_limits'}

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The host's lookout over four links: what is beyond its limit, and what that must lead to."""
+"""Comparison of the telemetry of four links with the safety rules."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from fourbar_ros.device.arming import DeviceState
 from fourbar_ros.device.interface import DeviceFault, Drive, Reaction
 from fourbar_ros.hardware.link_telemetry import LinkTelemetry
 from fourbar_ros.hardware.messages import LinkState
-from fourbar_ros.hardware.safety_table import SafetyTable, SafetyWatch
+from fourbar_ros.hardware.safety_table import CONDITIONS, SafetyTable
 from fourbar_ros.mechanism import LINK_NAMES, Mechanism
 
 
 class SafetyMonitor:
     """
-    Compares everything that is heard with its limit.
+    Checks every rule at every tick.
 
-    :param mechanism: limits of its motors.
-    :param table: the other limits, and reactions.
-    :param links: what is heard of them.
-    :param now_ns: of the host's steady clock [ns].
-    :ivar findings: of the last look, those that must have consequences now.
+    :param mechanism: has the limits of the motors.
+    :param table: limits and reactions.
+    :param links: telemetry of the links.
+    :param now_ns: time of the host's monotonic clock [ns].
+    :ivar faults: of the last check, those to which the device must react now.
     """
 
     def __init__(self, mechanism: Mechanism, table: SafetyTable, links: Sequence[LinkTelemetry],
@@ -31,132 +31,148 @@ class SafetyMonitor:
         self.faults: tuple[DeviceFault, ...] = ()
         self._mechanism = mechanism
         self._table = table
+        self._limits = {rule: row.limit for rule, row in table.items()}
         self._links = links
-        self._watch = SafetyWatch(table)
+        # By rule and subject (a link or the bus): since when its limit is exceeded [ns], and the
+        # message once that lasts too long.
+        self._exceeded_ns: dict[tuple[str, str], int] = {}
+        self._violations: dict[tuple[str, str], str] = {}
         self._state = DeviceState.DISARMED
-        self._since_ns = now_ns
-        self._armed_boots = [0 for _ in links]
-        # Whether a finding ended the driving and something is still wrong: it may get worse.
-        self._watched = False
-        self._bad = 0
-        self._bad_since_ns = now_ns
+        self._armed_ns = now_ns
+        self._restarts_at_arming = [0 for _ in links]
+        # Whether a fault has disarmed the device and is still present: it may become a stop.
+        self._escalates = False
+        self._rejected_frames = 0
+        self._rejected_since_ns = now_ns
 
-    def gate_changed(self, state: DeviceState, now_ns: int) -> None:
-        """Take note of another state of the device, and of how links are when they are armed."""
-        was, self._state = self._state, state
-        self._watched = (was, state) == (DeviceState.ARMED, DeviceState.DISARMED) and bool(
+    def arming_changed(self, state: DeviceState, now_ns: int) -> None:
+        """Take over the state of the device, and the number of restarts at arming."""
+        before, self._state = self._state, state
+        self._escalates = (before, state) == (DeviceState.ARMED, DeviceState.DISARMED) and bool(
             self.faults)
         if state is DeviceState.ARMED:
-            self._since_ns = now_ns
-            self._armed_boots = [link.boots for link in self._links]
+            self._armed_ns = now_ns
+            self._restarts_at_arming = [link.restarts for link in self._links]
 
-    def look(self, now_ns: int, drive: Drive, bad: int) -> None:
+    def check(self, now_ns: int, drive: Drive, rejected_frames: int) -> None:
         """
-        Take a look.
+        Compare the telemetry with the rules.
 
-        :param drive: what the links were told last.
-        :param bad: frames that were no good so far.
+        :param drive: the last one that was sent to the links.
+        :param rejected_frames: number of rejected frames since the start.
         """
         for index, (name, link) in enumerate(zip(LINK_NAMES, self._links)):
             if link.heartbeat_ns is not None:
-                self._look_at(index, name, link, now_ns, drive)
-        elapsed_s = (now_ns - self._bad_since_ns) * 1e-9
+                self._check_link(index, name, link, now_ns, drive)
+        elapsed_s = (now_ns - self._rejected_since_ns) * 1e-9
         if elapsed_s >= 1.0:
-            rate = (bad - self._bad) / elapsed_s
-            self._watch.look(
-                'bad_frames', 'bus', rate > self._table['bad_frames'].limit, rate,
-                '{0:.0f} frames a second are no good, limit {1:g}', now_ns)
-            self._bad, self._bad_since_ns = bad, now_ns
-        found = tuple(finding for finding in self._watch.faults()
-                      if finding.reaction is not Reaction.WARN)
-        self._watched &= bool(found)
-        if not self._driving(drive):
-            found = tuple(finding for finding in found
-                          if self._watched and finding.reaction is Reaction.STOP)
-        self.faults = found
+            rate = (rejected_frames - self._rejected_frames) / elapsed_s
+            self._check('bad_frames', 'bus', rate > self._limits['bad_frames'], rate, now_ns)
+            self._rejected_frames, self._rejected_since_ns = rejected_frames, now_ns
+        faults = tuple(fault for fault in self._sorted_faults()
+                       if fault.reaction is not Reaction.WARN)
+        self._escalates &= bool(faults)
+        if not self._is_driving(drive):
+            faults = tuple(fault for fault in faults
+                           if self._escalates and fault.reaction is Reaction.STOP)
+        self.faults = faults
 
     def arming_blockers(self) -> list[str]:
-        """Tell what speaks against arming: links, wheels, clocks, and what must not go on."""
-        told = [f'{name}: {text}' for name, link in zip(LINK_NAMES, self._links)
-                for text in self._obstacles_of(link)]
-        told += [finding.text for finding in self._watch.faults()
-                 if finding.reaction is not Reaction.WARN and finding.text not in told]
-        return told
+        """Return what prevents arming: state of links, wheels and clocks, and present faults."""
+        blockers = [f'{name}: {text}' for name, link in zip(LINK_NAMES, self._links)
+                    for text in self._link_blockers(link)]
+        return [*blockers, *(fault.text for fault in self._sorted_faults()
+                             if fault.reaction is not Reaction.WARN)]
 
-    def troubles(self) -> dict[str, str]:
-        """Tell by link, or bus, what is beyond its limit, the worst first."""
-        told: dict[str, str] = {}
-        for finding in self._watch.faults():
-            # None hides another.
-            where = finding.text.partition(':')[0]
-            told[where] = '; '.join(filter(None, (told.get(where), finding.text)))
-        return told
+    def diagnostics(self) -> dict[str, str]:
+        """Return by link, or bus, the present faults, the most severe first."""
+        texts: dict[str, list[str]] = {}
+        for fault in self._sorted_faults():
+            texts.setdefault(fault.text.partition(':')[0], []).append(fault.text)
+        return {subject: '; '.join(lines) for subject, lines in texts.items()}
 
-    def _driving(self, drive: Drive) -> bool:
-        """Tell whether a wheel may have power, be it to park it after commands stayed away."""
+    def _sorted_faults(self) -> list[DeviceFault]:
+        """Return all present faults, the most severe first."""
+        faults = [DeviceFault(self._table[rule].level, f'{subject}: {rule}: {text}')
+                  for (rule, subject), text in self._violations.items()]
+        return sorted(faults, key=lambda fault: -fault.reaction)
+
+    def _is_driving(self, drive: Drive) -> bool:
+        """Tell whether a wheel may have power, armed or after a command timeout."""
         return self._state is DeviceState.ARMED or bool(drive.powered.any())
 
-    def _obstacles_of(self, link: LinkTelemetry) -> list[str]:
+    def _link_blockers(self, link: LinkTelemetry) -> list[str]:
         if link.heartbeat_ns is None:
-            return ['was never heard']
-        told = []
+            return ['no heartbeat since start']
+        blockers = []
         if link.answer_ns is None:
-            told.append('its wheel was never heard')
+            blockers.append('no answer from the wheel since start')
         if not link.clock.settled:
-            told.append('its clock is not known yet')
+            blockers.append('the offset of its clock is not estimated yet')
         if link.state not in (LinkState.IDLE, LinkState.COASTING, None):
-            way_out = (', call reset_emergency_stop first'
-                       if link.state is LinkState.STOPPED else '')
-            told.append(f'its electronics say {link.state.name.lower()}{way_out}')
-        limit = self._table['wheel_speed_to_arm'].limit
-        if abs(link.wheel_speed) > limit:
-            told.append(f'its wheel turns at {abs(link.wheel_speed):.3g} rad/s, limit {limit:g}')
-        return told
+            remedy = (', call reset_emergency_stop first'
+                      if link.state is LinkState.STOPPED else '')
+            blockers.append(f'its state is {link.state.name.lower()}{remedy}')
+        limit, speed = self._limits['wheel_speed_to_arm'], abs(link.wheel_speed)
+        if speed > limit:
+            text = CONDITIONS['wheel_speed_to_arm'].text.format(value=speed, limit=limit)
+            blockers.append(f'wheel_speed_to_arm: {text}')
+        return blockers
 
-    def _look_at(self, index: int, name: str, link: LinkTelemetry, now_ns: int,
-                 drive: Drive) -> None:
-        table, look = self._table, self._watch.look
-        driving = self._driving(drive)
-        assert link.heartbeat_ns is not None
-        silence = (now_ns - (link.answer_ns or self._since_ns)) * 1e-9
-        look('wheel_silent', name, silence > table['wheel_silent'].limit, silence,
-             'its wheel has not answered for {0:.3g} s, limit {1:g}', now_ns)
-        silence = (now_ns - link.heartbeat_ns) * 1e-9
-        look('heartbeat_lost', name, silence > table['heartbeat_lost'].limit, silence,
-             'no heartbeat for {0:.3g} s, limit {1:g}', now_ns)
-        boots = link.boots - self._armed_boots[index] if driving else 0
-        look('reboot', name, boots > table['reboot'].limit, boots,
-             'it has started anew while it was armed', now_ns)
-        look('two_of_one_id', name, link.twins > table['two_of_one_id'].limit, link.twins + 1,
-             '{0} links answer to its id', now_ns)
-        powered = bool(drive.powered[index])
-        state = '' if link.state is None else link.state.name.lower()
-        look('not_armed', name, powered and link.state not in (LinkState.ARMED, None), state,
-             'it was told to drive, but says that it is {0}', now_ns)
-        torque_limit = float(self._mechanism.motor_torque_limits[index])
-        speed_limit = table['overspeed'].limit * float(self._mechanism.motor_speed_limits[index])
+    def _check_link(self, index: int, name: str, link: LinkTelemetry, now_ns: int, drive: Drive
+                    ) -> None:
+        limits = self._limits
+
+        def check(rule: str, exceeded: bool, value: object, limit: float | None = None) -> None:
+            self._check(rule, name, exceeded, value, now_ns, limit)
+
+        is_driving, powered = self._is_driving(drive), bool(drive.powered[index])
+        heartbeat = link.heartbeat
+        assert heartbeat is not None and link.heartbeat_ns is not None
+        silence_s = (now_ns - (link.answer_ns or self._armed_ns)) * 1e-9
+        check('wheel_silent', silence_s > limits['wheel_silent'], silence_s)
+        silence_s = (now_ns - link.heartbeat_ns) * 1e-9
+        check('heartbeat_lost', silence_s > limits['heartbeat_lost'], silence_s)
+        restarts = link.restarts - self._restarts_at_arming[index] if is_driving else 0
+        check('reboot', restarts > limits['reboot'], restarts)
+        check('two_of_one_id', link.duplicates > limits['two_of_one_id'], link.duplicates + 1)
+        check('not_armed', powered and link.state not in (LinkState.ARMED, None),
+              '' if link.state is None else link.state.name.lower())
         speed = abs(link.wheel_speed)
-        look('overspeed', name, speed > speed_limit, speed,
-             f'its wheel turns at {{0:.4g}} rad/s, limit {speed_limit:.4g}', now_ns)
-        look('unasked_torque', name, not powered and driving
-             and abs(link.torque) > table['unasked_torque'].limit * torque_limit, link.torque,
-             'its motor gives {0:.3g} N m without power', now_ns)
-        asked = float(drive.values[index])
+        limit = limits['overspeed'] * float(self._mechanism.motor_speed_limits[index])
+        check('overspeed', speed > limit, speed, limit)
+        torque_limit = float(self._mechanism.motor_torque_limits[index])
+        limit = limits['unasked_torque'] * torque_limit
+        check('unasked_torque', not powered and is_driving and abs(link.torque) > limit,
+              link.torque, limit)
+        difference = link.torque - float(drive.values[index])
+        limit = limits['disagreement'] * torque_limit
         by_torque = powered and not bool(drive.by_speed[index])
-        look('disagreement', name, by_torque and abs(asked - link.torque)
-             > table['disagreement'].limit * torque_limit, link.torque - asked,
-             'its motor is {0:.3g} N m off what it was told', now_ns)
-        self._look_at_health(name, link, now_ns)
+        check('disagreement', by_torque and abs(difference) > limit, difference, limit)
+        faults = ', '.join(sorted(heartbeat.faults - {'no_limits'}))
+        check('link_fault', bool(faults), faults)
+        for rule in ('hot', 'overtemperature'):
+            temperature = heartbeat.temperature
+            check(rule, temperature is not None and temperature > limits[rule], temperature)
+        for rule in ('low_voltage', 'undervoltage'):
+            voltage = heartbeat.voltage
+            check(rule, voltage is not None and voltage < limits[rule], voltage)
 
-    def _look_at_health(self, name: str, link: LinkTelemetry, now_ns: int) -> None:
-        beat, table, look = link.heartbeat, self._table, self._watch.look
-        assert beat is not None
-        faults = ', '.join(sorted(beat.faults - {'no_limits'}))
-        look('link_fault', name, bool(faults), faults, 'its electronics tell of {0}', now_ns)
-        for row in ('hot', 'overtemperature'):
-            look(row, name, beat.temperature is not None
-                 and beat.temperature > table[row].limit, beat.temperature,
-                 'it has {0:.3g} deg C, limit {1:g}', now_ns)
-        for row in ('low_voltage', 'undervoltage'):
-            look(row, name, beat.voltage is not None and beat.voltage < table[row].limit,
-                 beat.voltage, 'its supply has {0:.3g} V, at least {1:g}', now_ns)
+    def _check(self, rule: str, subject: str, exceeded: bool, value: object, now_ns: int,
+               limit: float | None = None) -> None:
+        """
+        Update the violation of one rule.
+
+        :param subject: the link, or the bus.
+        :param exceeded: whether the limit is exceeded now.
+        :param limit: shown in the message, by default that of the table.
+        """
+        key = rule, subject
+        if not exceeded:
+            self._exceeded_ns.pop(key, None)
+            self._violations.pop(key, None)
+            return
+        since_ns = self._exceeded_ns.setdefault(key, now_ns)
+        if now_ns - since_ns >= self._table[rule].lasting * 1e9:
+            self._violations[key] = CONDITIONS[rule].text.format(
+                value=value, limit=self._limits[rule] if limit is None else limit)

@@ -2,126 +2,102 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What the host watches on the prototype, with its limits, and what each leads to: a table in a file.
+Safety rules of the prototype: conditions, limits, and the reaction when a limit is exceeded.
 
-A lab may change limits and reactions, but not let go on what nobody can go on with.
+A lab may change limits and reactions in a file, but each rule has a least severe reaction.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from math import isfinite
-from typing import Any
+from dataclasses import dataclass, MISSING
+from typing import NamedTuple
 
 from fourbar_ros.common.config_files import config_file, load_yaml
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.common.settings import check_keys
-from fourbar_ros.device.interface import DeviceFault, Reaction
+from fourbar_ros.common.settings import check_keys, setting, SettingError, Settings
+from fourbar_ros.device.interface import Reaction
 
 
 class SafetyError(FourbarError):
-    """A table of limits and reactions that is refused."""
+    """A table of safety rules that is refused."""
+
+
+class Condition(NamedTuple):
+    """
+    What a rule watches.
+
+    :param least: least severe reaction that a file may choose.
+    :param text: message, with the fields `value` and `limit`.
+    """
+
+    least: Reaction
+    text: str
+
+
+_WARN, _COAST = Reaction.WARN, Reaction.COAST
+CONDITIONS = {
+    'wheel_silent': Condition(
+        _COAST, 'no answer from the wheel for {value:.3g} s, limit {limit:g} s'),
+    'heartbeat_lost': Condition(_COAST, 'no heartbeat for {value:.3g} s, limit {limit:g} s'),
+    'not_armed': Condition(_COAST, 'the wheel has power, but the link is {value}'),
+    'link_fault': Condition(_COAST, 'the link reports {value}'),
+    'reboot': Condition(_COAST, 'the link has restarted while armed'),
+    'two_of_one_id': Condition(_COAST, '{value} links use this identifier'),
+    'overspeed': Condition(_COAST, 'wheel speed {value:.4g} rad/s, limit {limit:.4g} rad/s'),
+    'unasked_torque': Condition(
+        _COAST, 'motor torque {value:.3g} N m without power, limit {limit:.3g} N m'),
+    'disagreement': Condition(
+        _WARN, 'motor torque differs from the command by {value:.3g} N m, limit {limit:.3g} N m'),
+    'hot': Condition(_WARN, 'temperature {value:.3g} deg C, limit {limit:g} deg C'),
+    'overtemperature': Condition(_COAST, 'temperature {value:.3g} deg C, limit {limit:g} deg C'),
+    'low_voltage': Condition(_WARN, 'supply voltage {value:.3g} V, limit at least {limit:g} V'),
+    'undervoltage': Condition(_COAST, 'supply voltage {value:.3g} V, limit at least {limit:g} V'),
+    'bad_frames': Condition(_WARN, '{value:.0f} rejected frames per second, limit {limit:g}'),
+    'wheel_speed_to_arm': Condition(
+        _COAST, 'wheel speed {value:.3g} rad/s, limit for arming {limit:g} rad/s'),
+}
+"""By name of the rule. Conditions under which a wheel may be out of control at least coast."""
 
 
 @dataclass(frozen=True)
-class Rule:
-    """
-    One row of the table.
+class Rule(Settings):
+    """One rule of the table; its limit is in the unit of its condition."""
 
-    :param limit: what is still allowed, in the row's own unit.
-    :param lasting: for how long more is borne [s].
-    :param reaction: what it leads to then.
-    """
+    limit: float = setting(MISSING, '', 'largest allowed value', low=0.0)
+    lasting: float = setting(MISSING, 's', 'time for which the limit may be exceeded', low=0.0)
+    reaction: str = setting(MISSING, '', 'reaction after that time',
+                            choices=tuple(reaction.name.lower() for reaction in Reaction))
 
-    limit: float
-    lasting: float
-    reaction: Reaction
+    @property
+    def level(self) -> Reaction:
+        """The reaction."""
+        return Reaction[self.reaction.upper()]
 
 
-# The rows, with the least reaction to each. Where a wheel is not heard, or turns for no reason,
-# there is no going on.
-LEAST = {
-    'wheel_silent': Reaction.COAST, 'heartbeat_lost': Reaction.COAST,
-    'not_armed': Reaction.COAST, 'link_fault': Reaction.COAST, 'reboot': Reaction.COAST,
-    'two_of_one_id': Reaction.COAST, 'overspeed': Reaction.COAST,
-    'unasked_torque': Reaction.COAST, 'disagreement': Reaction.WARN, 'hot': Reaction.WARN,
-    'overtemperature': Reaction.COAST, 'low_voltage': Reaction.WARN,
-    'undervoltage': Reaction.COAST, 'bad_frames': Reaction.WARN,
-    'wheel_speed_to_arm': Reaction.COAST,
-}
 SafetyTable = Mapping[str, Rule]
 
 
 def load_safety(name: str) -> SafetyTable:
     """
-    Read a table of limits and reactions.
+    Read a table of safety rules.
 
     :param name: a preset (`prototype` for config/safety_prototype.yaml) or the path of a file.
     :raises ConfigurationError: no such preset or file, or not YAML.
-    :raises SafetyError: a row is missing, unknown or refused.
+    :raises SafetyError: a rule is missing, unknown or refused.
     """
     path = config_file('safety', name)
     values = load_yaml(path)
-    check_keys(values, set(LEAST), str(path), SafetyError)
-    return {row: _rule(values[row], f'{path}: {row}', LEAST[row]) for row in LEAST}
-
-
-def _rule(values: Any, origin: str, least: Reaction) -> Rule:
-    if not isinstance(values, dict):
-        raise SafetyError(f'{origin} must be limit, lasting and reaction, got {values!r}')
-    check_keys(values, {'limit', 'lasting', 'reaction'}, origin, SafetyError)
-    for key in ('limit', 'lasting'):
-        value = values[key]
-        if isinstance(value, bool) or not isinstance(value, int | float) or not (
-                isfinite(value) and value >= 0.0):
-            raise SafetyError(f'{origin}: {key} must be a number and not negative, got {value!r}')
-    choices = {reaction.name.lower(): reaction for reaction in Reaction}
-    reaction = choices.get(values['reaction'])
-    if reaction is None:
-        raise SafetyError(f'{origin}: reaction must be one of {", ".join(choices)}, '
-                          f'got {values["reaction"]!r}')
-    if reaction < least:
-        raise SafetyError(f'{origin}: reaction must be at least {least.name.lower()}, '
-                          f'got {values["reaction"]}')
-    return Rule(float(values['limit']), float(values['lasting']), reaction)
-
-
-class SafetyWatch:
-    """
-    Takes down what is beyond its limit, and since when.
-
-    :param table: the limits and reactions.
-    """
-
-    def __init__(self, table: SafetyTable) -> None:
-        self.table = table
-        self._since_ns: dict[tuple[str, str], int] = {}
-        self._found: dict[tuple[str, str], str] = {}
-
-    def look(self, row: str, where: str, beyond: bool, value: object, text: str, now_ns: int
-             ) -> None:
-        """
-        Take a look at one thing.
-
-        :param row: of the table.
-        :param where: the link, or the bus.
-        :param beyond: whether it is beyond its limit now.
-        :param value: what it is now.
-        :param text: to say it with, `{0}` for the value and `{1}` for the limit.
-        :param now_ns: any clock that does not go back [ns].
-        """
-        key = row, where
-        if not beyond:
-            self._since_ns.pop(key, None)
-            self._found.pop(key, None)
-            return
-        since_ns = self._since_ns.setdefault(key, now_ns)
-        if now_ns - since_ns >= self.table[row].lasting * 1e9:
-            self._found[key] = text.format(value, self.table[row].limit)
-
-    def faults(self) -> tuple[DeviceFault, ...]:
-        """Return what is beyond its limit for too long, the worst first."""
-        found = [DeviceFault(self.table[row].reaction, f'{where}: {text}')
-                 for (row, where), text in self._found.items()]
-        return tuple(sorted(found, key=lambda finding: -finding.reaction))
+    check_keys(values, set(CONDITIONS), str(path), SafetyError)
+    table = {}
+    for name, condition in CONDITIONS.items():
+        try:
+            rule = table[name] = Rule.from_mapping(values[name], name)
+        except SettingError as error:
+            raise error.at(f'{path}: {name}', SafetyError) from None
+        if rule.level < condition.least:
+            least = condition.least.name.lower()
+            raise SafetyError(
+                f'{path}: {name}: reaction must be at least {least}, got {rule.reaction}',
+                name='reaction', place=f'{path}: {name}', value=rule.reaction, limit=least)
+    return table

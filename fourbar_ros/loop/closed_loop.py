@@ -57,7 +57,7 @@ class ClosedLoop:
         self._next_ns += self.testbed.device.period_ns
         samples, _ = self.testbed.tick(stamp_ns, stamp_ns)
         self.testbed.published(stamp_ns, 0)
-        self.controller.device_armed(self.testbed.gate.armed)
+        self.controller.device_armed(self.testbed.arming.armed)
         for sample in samples.links:
             with suppress(RejectedError):
                 self.estimator.measure(

@@ -138,7 +138,7 @@ class DeviceNode(BaseNode):
         Commands that arrived in between are handled before the next tick.
         """
         self._catching_up = False
-        if self._supervisor.gate.state is not DeviceState.FAULT:
+        if self._supervisor.arming.state is not DeviceState.FAULT:
             stamp_ns = self.clock_mode.due(monotonic_ns())
             if stamp_ns is not None:
                 self._tick(stamp_ns)
@@ -154,7 +154,7 @@ class DeviceNode(BaseNode):
         :returns: its stamp [ns].
         :raises FourbarError: the clock is not paused, or no tick can be made now.
         """
-        gate = self._supervisor.gate
+        gate = self._supervisor.arming
         if gate.state is DeviceState.FAULT:
             raise ClockModeError(
                 f'{gate.state.value} ({gate.reason}), call reset_emergency_stop first')
@@ -228,7 +228,7 @@ class DeviceNode(BaseNode):
                 self.now_ns(), self._arming_blockers())
         else:
             self._supervisor.disarm('disarmed on request')
-            response.success, response.message = True, self._supervisor.gate.state.value
+            response.success, response.message = True, self._supervisor.arming.state.value
         self.publish_status()
         return response
 
@@ -255,7 +255,7 @@ class DeviceNode(BaseNode):
             self.publish_status()
 
     def _report(self) -> Report:
-        gate = self._supervisor.gate
+        gate = self._supervisor.arming
         level, summary = LEVELS[gate.state], gate.state.value
         if self._rejected.update(self._supervisor.rejected.total()) and level == OK:
             level, summary = WARN, f'{summary}, commands were rejected'
@@ -278,7 +278,7 @@ class DevicePublishers:
 
     def __init__(self, node: DeviceNode, supervisor: DeviceSupervisor, mechanism: str) -> None:
         self._node = node
-        self._gate = supervisor.gate
+        self._gate = supervisor.arming
         self._device = device = supervisor.device
         self._mechanism = mechanism
         self._published_state: tuple[DeviceState, str, int] | None = None

@@ -8,23 +8,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fourbar_ros.common.monotonic_clock import monotonic_ns
-from fourbar_ros.common.settings import Setting
+from fourbar_ros.common.settings import settings_of
 from fourbar_ros.device import Device
 from fourbar_ros.hardware.bus_settings import bus_parameters, make_codec, open_bus
-from fourbar_ros.hardware.prototype import Prototype
+from fourbar_ros.hardware.prototype import Prototype, PrototypeSettings
 from fourbar_ros.hardware.safety_table import load_safety
 from fourbar_ros.mechanism import load_mechanism
-from fourbar_ros.ros.base_node import run_node
+from fourbar_ros.ros.base_node import run_node, settings_from
 from fourbar_ros.ros.device_node import device_parameters, DeviceNode
 from fourbar_ros.ros.runtime import Runtime
 
 PARAMETERS = (
     *device_parameters('prototype'),
     *bus_parameters('socketcan', 'can0', ''),
-    Setting('safety', 'prototype', '', 'preset or path of a table of limits and reactions'),
-    Setting('answer_timeout', 0.002, 's', 'longest wait of a tick for the answers of the wheels',
-            low=1e-4, high=0.1),
-    Setting('gyro', False, '', 'whether the links have gyros'),
+    *settings_of(PrototypeSettings),
 )
 
 
@@ -38,10 +35,11 @@ class HardwareNode(DeviceNode):
         """Return the prototype that the parameters describe."""
         values = self.values
         mechanism = load_mechanism(values['mechanism'])
+        settings = settings_from(PrototypeSettings, values)
         return Prototype(
             mechanism, lambda: open_bus(values), make_codec(values, mechanism),
-            load_safety(values['safety']), self.period_ns, values['answer_timeout'],
-            values['gyro'], monotonic_ns, lambda time_ns: self.clock_mode.now_ns(time_ns))
+            load_safety(settings.safety), settings, self.period_ns, monotonic_ns,
+            lambda time_ns: self.clock_mode.now_ns(time_ns))
 
 
 def main(argv: Sequence[str]) -> int:

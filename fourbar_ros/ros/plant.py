@@ -14,13 +14,13 @@ from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.monotonic_clock import monotonic_ns
 from fourbar_ros.common.settings import Setting
 from fourbar_ros.device import (
-    ClockLimit,
     ClockMode,
     Device,
     FastClock,
     LockstepClock,
     LockstepGuard,
     Participants,
+    RateLimit,
     Recovery,
     Samples,
 )
@@ -180,7 +180,7 @@ class SimulatedClock:
 
     def __init__(self, node: DeviceNode) -> None:
         self._clock_mode = node.clock_mode
-        self._limit = ClockLimit(CLOCK_NS)
+        self._limit = RateLimit(CLOCK_NS)
         self._message = ClockMessage()
         self._publisher = node.create_publisher(ClockMessage, names.CLOCK, RELIABLE)
         create_steady_timer(node, IDLE_CLOCK_NS * 1e-9, self.publish)
@@ -217,7 +217,7 @@ class Lockstep:
 
     def overdue(self) -> str:
         """Return the node whose answer to the tick is overdue, '' for none."""
-        return self._guard.awaited(self._estimate_ns(), monotonic_ns())
+        return self._guard.waiting_for(self._estimate_ns(), monotonic_ns())
 
     def _on_waiting(self, message: Header) -> None:
         # Without an estimate the controller sends no command at this tick.
@@ -246,7 +246,7 @@ class Lockstep:
             return info.node_namespace, info.node_name
         commanders = publishers(names.FLYWHEEL_COMMAND)
         controllers = set(map(node_of, commanders))
-        self._guard.look(Participants(
+        self._guard.update(Participants(
             len(subscribers(names.FLYWHEEL_STATES)), len(subscribers(names.LINK_ANGLES)),
             len(commanders), len(publishers(names.ESTIMATE_LINK_STATES)),
             # Subscribers that only monitor need no estimator.
@@ -256,7 +256,7 @@ class Lockstep:
         if overdue and overdue != self._reported:
             self._log.warn(f'lock-step waits for the {overdue}')
         if overdue or self._reported:
-            self._plant.recover(self._guard.remedy(self._estimate_ns(), now_ns))
+            self._plant.recover(self._guard.recovery(self._estimate_ns(), now_ns))
         self._reported = overdue
 
 

@@ -11,20 +11,18 @@ import time
 from typing import Any
 
 from fourbar_ros.common.monotonic_clock import monotonic_ns
-from fourbar_ros.common.settings import Setting
+from fourbar_ros.common.settings import Setting, settings_of
 from fourbar_ros.hardware.bus_settings import bus_parameters, make_codec, open_bus
 from fourbar_ros.hardware.emulator import (
-    BUS_TROUBLES,
-    check_trouble,
-    ClockSettings,
+    check_injected_fault,
     Emulator,
-    LINK_TROUBLES,
-    TroubleError,
+    EmulatorError,
+    EmulatorSettings,
+    INJECTABLE_BUS_FAULTS,
+    INJECTABLE_LINK_FAULTS,
 )
-from fourbar_ros.hardware.firmware import FirmwareSettings
-from fourbar_ros.hardware.poll_loop import attend
 from fourbar_ros.mechanism import LINK_NAMES
-from fourbar_ros.ros.base_node import BaseNode, run_node
+from fourbar_ros.ros.base_node import BaseNode, run_node, settings_from
 from fourbar_ros.ros.runtime import Runtime
 from fourbar_ros.ros.simulation import apply_faults, GroundTruth, make_table, table_parameters
 import numpy as np
@@ -37,20 +35,13 @@ PARAMETERS = (
     Setting('mechanism', 'prototype', '', 'preset or path of a mechanism file'),
     *bus_parameters('fourbar_udp', '127.0.0.1:29537', 'peers=127.0.0.1:29536'),
     Setting('links', LETTERS, '', 'letters of the links that exist'),
-    Setting('rate', 1000.0, 'Hz', 'control rate of the electronics', low=100.0, high=2000.0),
-    Setting('truth_rate', 250.0, 'Hz', 'rate of the ground truth on sim/', low=1.0, high=1000.0),
-    Setting('command_timeout', 0.1, 's', 'longest time without a command before a link coasts',
-            low=0.01, high=10.0),
-    Setting('clock_offset', 100.0, 's', 'reading of the clock of link a at the start; each next '
-            'link is 7 s ahead', low=0.0, high=4000.0),
-    Setting('clock_drift', 30e-6, 's/s', 'rate error of the clocks: positive in links a and b, '
-            'negative in c and d', low=0.0, high=1e-3),
+    *settings_of(EmulatorSettings),
     # The links are placed at the start only: this node has no sim/reset.
     *(replace(row, live=False) if row.name.startswith('initial.') else row
       for row in table_parameters('prototype')),
     *(Setting(f'trouble.{target}', '', '', ' or '.join(troubles), live=True)
-      for target, troubles in (*((name, LINK_TROUBLES) for name in LINK_NAMES),
-                               ('bus', BUS_TROUBLES))),
+      for target, troubles in (*((name, INJECTABLE_LINK_FAULTS) for name in LINK_NAMES),
+                               ('bus', INJECTABLE_BUS_FAULTS))),
 )
 TROUBLES = {row.name: row.name.partition('.')[2] for row in PARAMETERS
             if row.name.startswith('trouble.')}
@@ -65,18 +56,15 @@ class EmulatorNode(BaseNode):
         values = self.values
         letters = values['links']
         if not letters or set(letters) - set(LETTERS) or len(set(letters)) < len(letters):
-            raise TroubleError(f'links must be some of {LETTERS}, got {letters!r}',
-                               name='links', value=letters, limit=LETTERS)
+            raise EmulatorError(f'links must be some of {LETTERS}, got {letters!r}',
+                                name='links', value=letters, limit=LETTERS)
         self._table = make_table(values, round(1e9 / values['rate']))
         self._bus = open_bus(values)
         now_ns, stamp_ns = monotonic_ns(), time.time_ns()
-        offset, drift = values['clock_offset'], values['clock_drift']
+        settings = settings_from(EmulatorSettings, values)
         self._emulator = Emulator(
             self._table, make_codec(values, self._table.mechanism),
-            [LETTERS.index(letter) for letter in letters],
-            FirmwareSettings(values['command_timeout']),
-            ClockSettings((offset, offset + 7.0, offset + 14.0, offset + 21.0),
-                          (drift, 0.5 * drift, -0.5 * drift, -drift)),
+            [LETTERS.index(letter) for letter in letters], settings,
             # Without a seed: two emulators with equal parameters still have different jitter.
             np.random.default_rng(), now_ns, stamp_ns)
         self._apply_trouble(dict.fromkeys(TROUBLES, ''), values)
@@ -95,7 +83,7 @@ class EmulatorNode(BaseNode):
     def run_once(self) -> None:
         """Serve the next frame or step; then publish the ground truth and run callbacks if due."""
         emulator = self._emulator
-        now_ns = attend(emulator, self._bus, monotonic_ns)
+        now_ns = emulator.serve(self._bus, monotonic_ns)
         samples = emulator.samples
         if (now_ns - self._truth_ns >= self._truth_period_ns and samples is not None
                 and samples.truth is not None):
@@ -110,7 +98,7 @@ class EmulatorNode(BaseNode):
     def parameters_changed(self, values: dict[str, Any]) -> None:
         """Set and clear trouble and faults; a refused value changes nothing."""
         for name, target in TROUBLES.items():
-            check_trouble(target, values[name])
+            check_injected_fault(target, values[name])
         apply_faults(self._table, self.values, values)
         self._apply_trouble(self.values, values)
 
@@ -123,7 +111,7 @@ class EmulatorNode(BaseNode):
     def _apply_trouble(self, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
         for name, target in TROUBLES.items():
             if now[name] != before[name]:
-                self._emulator.trouble(target, now[name])
+                self._emulator.inject_fault(target, now[name])
 
 
 def main(argv: Sequence[str]) -> int:

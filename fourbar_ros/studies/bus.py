@@ -22,10 +22,8 @@ from fourbar_ros.device import Device, DeviceState, Drive
 from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.hardware.can_port import Port
 from fourbar_ros.hardware.dbc_codec import DbcCodec
-from fourbar_ros.hardware.emulator import ClockSettings, Emulator
-from fourbar_ros.hardware.firmware import FirmwareSettings
-from fourbar_ros.hardware.poll_loop import attend
-from fourbar_ros.hardware.prototype import Prototype
+from fourbar_ros.hardware.emulator import Emulator, EmulatorSettings
+from fourbar_ros.hardware.prototype import Prototype, PrototypeSettings
 from fourbar_ros.hardware.safety_table import load_safety
 from fourbar_ros.hardware.udp_bus import UdpBus
 from fourbar_ros.mechanism import load_mechanism
@@ -72,7 +70,8 @@ def run(progress: Progress, seconds: int = SECONDS) -> Result:
         here.send(_address(host))
         prototype = Prototype(
             load_mechanism('prototype'), lambda: Port(host, 'fourbar_udp', _address(host)),
-            DbcCodec(), load_safety('prototype'), PERIOD_NS, ANSWER_TIMEOUT_S, False, monotonic_ns,
+            DbcCodec(), load_safety('prototype'),
+            PrototypeSettings(answer_timeout=ANSWER_TIMEOUT_S), PERIOD_NS, monotonic_ns,
             lambda time_ns: time_ns)
         round_trips, counts = _drive(prototype, progress, seconds)
         prototype.close()
@@ -95,8 +94,7 @@ def _emulator() -> Emulator:
     plant = Plant(load_mechanism('prototype'), load_table('prototype'), InitialState(), 5e-4,
                   np.random.default_rng(0))
     emulator = Emulator(
-        SimulatedTable(plant, 1_000_000), DbcCodec(), range(4), FirmwareSettings(),
-        ClockSettings((100.0, 107.0, 114.0, 121.0), (3e-5, 1.5e-5, -1.5e-5, -3e-5)),
+        SimulatedTable(plant, 1_000_000), DbcCodec(), range(4), EmulatorSettings(),
         np.random.default_rng(), monotonic_ns(), time.time_ns())
     emulator.advance(emulator.next_ns)
     return emulator
@@ -110,7 +108,7 @@ def _be_links(stop: Event, host: Any) -> None:
     bus.add_peer(host.recv())
     port = Port(bus, 'fourbar_udp', _address(bus))
     while not stop.is_set():
-        attend(emulator, port, monotonic_ns)
+        emulator.serve(port, monotonic_ns)
     host.send({f'commands_{kind}': sum(one.counts[kind] for one in emulator.firmware)
                for kind in ('lost_commands', 'replayed')})
     port.close()
@@ -149,12 +147,12 @@ def _drive(prototype: Prototype, progress: Progress, seconds: int
 
 
 def _arm(device: Device) -> None:
-    device.gate_changed(DeviceState.ARMED)
+    device.arming_changed(DeviceState.ARMED)
 
 
 def _counts(prototype: Prototype) -> dict[str, int]:
-    facts = prototype.facts()
-    bus = {f'frames_{kind}': int(str(facts[f'frames_{kind}'])) for kind in ('sent', 'received')}
+    values = prototype.diagnostic_values()
+    bus = {f'frames_{kind}': int(str(values[f'frames_{kind}'])) for kind in ('sent', 'received')}
     return {**bus, **{kind: sum(link.counts[kind] for link in prototype.links)
                       for kind in (*LOST, 'late')}}
 

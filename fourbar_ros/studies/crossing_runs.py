@@ -110,8 +110,8 @@ def go(run: Run) -> Passage:
             assert truth is not None
             angles.append(truth.link_angles)
             torque = max(torque, float(np.abs(truth.efforts).max()))
-        if not loop.testbed.gate.armed:
-            reason = loop.testbed.gate.reason
+        if not loop.testbed.arming.armed:
+            reason = loop.testbed.arming.reason
     except FourbarError as failure:
         reason = str(failure)
     way = np.reshape(angles, (-1, 4))

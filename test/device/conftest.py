@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.device import (
-    ArmingGate,
+    Arming,
     Device,
     DeviceFault,
     DeviceState,
@@ -38,7 +38,7 @@ class Bench(Device):
         without power there is none.
     :ivar powered: which wheels had power in every step.
     :ivar gate: set by whoever wants to know its state (and reason) at the last step.
-    :ivar gate_then: that state and reason.
+    :ivar arming_then: that state and reason.
     :ivar links: the links that give a sample.
     :ivar breaks: whether the next step fails.
     :ivar complete: whether it hears its wheels.
@@ -66,8 +66,8 @@ class Bench(Device):
         self.held: list[str] = []
         self.releases = 0
         self.closed = False
-        self.gate = ArmingGate()
-        self.gate_then = (self.gate.state, '')
+        self.arming = Arming()
+        self.arming_then = (self.arming.state, '')
         self.speeds = np.array([10.0, -20.0, 0.0, 5.0])
 
     def drive(self, drive: Drive) -> None:
@@ -76,7 +76,7 @@ class Bench(Device):
             raise FourbarError('the bus is off')
         self.told.append(drive)
 
-    def gate_changed(self, state: DeviceState) -> None:
+    def arming_changed(self, state: DeviceState) -> None:
         """Take down what the gate does."""
         self.gates.append(state)
 
@@ -105,7 +105,7 @@ class Bench(Device):
             drive.powered, np.where(drive.by_speed, following, drive.values), 0.0)
         self.powered.append(drive.powered.tolist())
         self.driven.append(torques)
-        self.gate_then = (self.gate.state, self.gate.reason)
+        self.arming_then = (self.arming.state, self.arming.reason)
         if self.breaks:
             raise FourbarError('the bus is off')
         self.speeds = self.speeds + torques / self.mechanism.flywheel_inertias * 4e-3
@@ -121,7 +121,7 @@ class Operated:
     def __init__(self, mechanism: Mechanism, settings: SupervisorSettings) -> None:
         self.bench = Bench(mechanism)
         self.testbed = DeviceSupervisor(self.bench, settings)
-        self.bench.gate = self.testbed.gate
+        self.bench.arming = self.testbed.arming
         self.stamp_ns = 1_000_000_000
         self.monotonic_ns = 50_000_000_000
 

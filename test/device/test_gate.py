@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fourbar_ros.device import DeviceState
-from fourbar_ros.device.arming import ArmingGate
+from fourbar_ros.device.arming import Arming
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
@@ -15,7 +15,7 @@ import pytest
 DISARMED, ARMED, STOPPED, FAULT = (
     DeviceState.DISARMED, DeviceState.ARMED, DeviceState.EMERGENCY_STOP, DeviceState.FAULT)
 NOW = 5
-EVENTS: dict[str, Callable[[ArmingGate], Any]] = {
+EVENTS: dict[str, Callable[[Arming], Any]] = {
     'arm': lambda gate: gate.arm(NOW, []),
     'arm despite an obstacle': lambda gate: gate.arm(NOW, ['the door is open']),
     'disarm': lambda gate: gate.disarm(NOW, 'new reason'),
@@ -41,9 +41,9 @@ AFTER = {
 }
 
 
-def gate_in(state: DeviceState) -> ArmingGate:
+def gate_in(state: DeviceState) -> Arming:
     """Bring a new gate into a state, through the events that lead there."""
-    gate = ArmingGate()
+    gate = Arming()
     for event in WAYS[state]:
         EVENTS[event](gate)
     gate.reason, gate.since_ns = 'old reason', 1
@@ -67,8 +67,8 @@ def test_event_leads_where_the_table_says(event: str, before: DeviceState) -> No
 
 
 def test_new_gate_is_disarmed() -> None:
-    assert ArmingGate().state is DISARMED
-    assert not ArmingGate().armed
+    assert Arming().state is DISARMED
+    assert not Arming().armed
 
 
 @pytest.mark.parametrize(('state', 'arming_blockers', 'needles'), [
@@ -101,7 +101,7 @@ def test_reset_always_succeeds_and_tells_what_it_released(state: DeviceState) ->
 @given(events=st.lists(st.sampled_from(sorted(EVENTS)), max_size=30))
 def test_only_a_reset_and_then_arm_lead_from_a_latched_state_to_armed(events: list[str]) -> None:
     """Whatever happens, `armed` is entered from `disarmed` alone, and only when asked."""
-    gate = ArmingGate()
+    gate = Arming()
     for event in events:
         before = gate.state
         EVENTS[event](gate)

@@ -16,8 +16,8 @@ def waiting() -> tuple[LockstepClock, LockstepGuard, int]:
     """Return a lock-step whose first tick just went out to all, its guard and the time."""
     pace = LockstepClock(PERIOD)
     guard = LockstepGuard(pace, TIMEOUT, SETTLE)
-    guard.look(ALL, 0)
-    guard.look(ALL, SETTLE)
+    guard.update(ALL, 0)
+    guard.update(ALL, SETTLE)
     assert pace.due(SETTLE) == FIRST
     return pace, guard, SETTLE
 
@@ -26,7 +26,7 @@ def test_tick_is_sent_again_after_the_timeout_at_intervals_that_grow() -> None:
     _, guard, start = waiting()
     step = TIMEOUT // 20
     times = [n * step for n in range(20 * 60)
-             if guard.remedy(None, start + n * step) is not Recovery.NOTHING]
+             if guard.recovery(None, start + n * step) is not Recovery.NOTHING]
     intervals = [after - before for before, after in zip([0, *times], times)]
     assert times[0] == TIMEOUT + step
     assert intervals == sorted(intervals)
@@ -36,38 +36,38 @@ def test_tick_is_sent_again_after_the_timeout_at_intervals_that_grow() -> None:
 
 
 def test_link_angles_go_out_again_only_if_the_estimator_said_nothing() -> None:
-    for estimate, remedy in ((None, Recovery.SEND_ALL), (FIRST - PERIOD, Recovery.SEND_ALL),
+    for estimate, recovery in ((None, Recovery.SEND_ALL), (FIRST - PERIOD, Recovery.SEND_ALL),
                              (FIRST, Recovery.SEND_TICK)):
         _, guard, start = waiting()
-        assert guard.remedy(estimate, start + TIMEOUT + 1) is remedy
+        assert guard.recovery(estimate, start + TIMEOUT + 1) is recovery
 
 
 def test_answered_tick_needs_no_help() -> None:
     pace, guard, start = waiting()
     assert pace.answered(FIRST)
-    assert guard.remedy(FIRST, start + 100 * TIMEOUT) is Recovery.NOTHING
+    assert guard.recovery(FIRST, start + 100 * TIMEOUT) is Recovery.NOTHING
 
 
 def test_every_tick_has_its_own_patience() -> None:
     pace, guard, now = waiting()
     for _ in range(3):
-        assert guard.remedy(None, now + TIMEOUT) is Recovery.NOTHING
+        assert guard.recovery(None, now + TIMEOUT) is Recovery.NOTHING
         now += TIMEOUT + 1
-        assert guard.remedy(None, now) is Recovery.SEND_ALL
+        assert guard.recovery(None, now) is Recovery.SEND_ALL
         assert pace.answered(pace.now_ns(now))
         assert pace.due(now) is not None
 
 
 def test_nothing_is_sent_to_nobody() -> None:
     _, guard, start = waiting()
-    guard.look(Participants(1, 1, 0, 1, 0), start + 1)
-    assert guard.remedy(None, start + 5 * TIMEOUT) is Recovery.NOTHING
+    guard.update(Participants(1, 1, 0, 1, 0), start + 1)
+    assert guard.recovery(None, start + 5 * TIMEOUT) is Recovery.NOTHING
 
 
 def test_tick_that_went_out_before_somebody_joined_is_given_up() -> None:
     _, guard, start = waiting()
-    guard.look(Participants(1, 1, 0, 1, 0), start + 1)
-    guard.look(ALL, start + 2 * TIMEOUT)
-    remedies = [guard.remedy(None, start + 2 * TIMEOUT + n * SETTLE // 4) for n in range(12)]
-    assert set(remedies[:4]) == {Recovery.NOTHING}
-    assert remedies[4] is Recovery.GIVE_UP
+    guard.update(Participants(1, 1, 0, 1, 0), start + 1)
+    guard.update(ALL, start + 2 * TIMEOUT)
+    recoveries = [guard.recovery(None, start + 2 * TIMEOUT + n * SETTLE // 4) for n in range(12)]
+    assert set(recoveries[:4]) == {Recovery.NOTHING}
+    assert recoveries[4] is Recovery.GIVE_UP

@@ -5,13 +5,14 @@
 
 from collections.abc import Callable
 from math import inf, nan
+from typing import Any
 
 from fourbar_ros.device import (
-    ClockLimit,
     ClockMode,
     ClockModeError,
     FastClock,
     LockstepClock,
+    RateLimit,
     RealtimeClock,
 )
 from fourbar_ros.device.clock_modes import FIRST_STAMP_NS
@@ -150,9 +151,10 @@ def test_ticks_stay_on_the_grid_through_pauses_and_steps(make: Callable[[], Cloc
 
 
 @every_clock
-def test_running_clock_is_not_stepped(make: Callable[[], ClockMode]) -> None:
+def test_running_clock_is_not_stepped(
+        make: Callable[[], ClockMode], refuses: Callable[..., Any]) -> None:
     clock = make()
-    with pytest.raises(ClockModeError, match='running, pause it first'):
+    with refuses(ClockModeError, state='running'):
         clock.step(STEADY)
     assert clock.due(STEADY) is not None
 
@@ -184,8 +186,8 @@ def test_fastest_time_always_has_a_tick_to_make() -> None:
 
 
 @pytest.mark.parametrize('factor', [-1.0, inf, nan])
-def test_impossible_factor_is_refused(factor: float) -> None:
-    with pytest.raises(ClockModeError, match='real-time factor'):
+def test_impossible_factor_is_refused(factor: float, refuses: Callable[..., Any]) -> None:
+    with refuses(ClockModeError, name='real_time_factor', limit=0.0):
         fast(factor)
 
 
@@ -203,19 +205,19 @@ def test_lockstep_waits_for_the_answer_to_this_tick() -> None:
     assert clock.now_ns(later + 10 ** 12) == FIRST_STAMP_NS + PERIOD
 
 
-def test_lockstep_makes_no_tick_for_nobody() -> None:
+def test_lockstep_makes_no_tick_before_it_is_ready(refuses: Callable[..., Any]) -> None:
     clock = LockstepClock(PERIOD)
     assert clock.due(STEADY) is None
     clock.pause(STEADY)
-    with pytest.raises(ClockModeError, match='nobody is there'):
+    with refuses(ClockModeError, state='not ready'):
         clock.step(STEADY)
 
 
-def test_lockstep_takes_one_step_at_a_time() -> None:
+def test_lockstep_takes_one_step_at_a_time(refuses: Callable[..., Any]) -> None:
     clock = lockstep()
     clock.pause(STEADY)
     assert clock.step(STEADY) == FIRST_STAMP_NS
-    with pytest.raises(ClockModeError, match='1.000000000 s is not answered yet'):
+    with refuses(ClockModeError, state='pending', pending_ns=1_000_000_000):
         clock.step(STEADY)
     assert clock.answered(FIRST_STAMP_NS)
     assert clock.due(STEADY) is None
@@ -223,7 +225,7 @@ def test_lockstep_takes_one_step_at_a_time() -> None:
 
 
 def test_clock_is_told_no_more_often_than_asked() -> None:
-    limit = ClockLimit(5_000_000)
+    limit = RateLimit(5_000_000)
     told = [now for now in range(0, 1_000_000_000, 700_000) if limit.passes(now)]
     assert min(after - before for before, after in zip(told, told[1:])) >= 5_000_000
     assert len(told) > 150

@@ -122,7 +122,7 @@ def test_command_older_than_the_last_one_is_rejected(operate: Operate) -> None:
     bed = operate()
     bed.tick()
     bed.command(1e-5)
-    with pytest.raises(RejectedError, match='older than that of the last command') as caught:
+    with pytest.raises(RejectedError) as caught:
         bed.command(2e-5, ahead_ns=-PERIOD_NS)
     assert caught.value.kind == 'stale'
     bed.command(3e-5)
@@ -132,8 +132,9 @@ def test_command_older_than_the_last_one_is_rejected(operate: Operate) -> None:
 
 def test_command_before_the_first_tick_is_rejected(operate: Operate) -> None:
     bed = operate(armed=False)
-    with pytest.raises(RejectedError, match='no tick to answer yet'):
+    with pytest.raises(RejectedError) as caught:
         bed.command(1e-5)
+    assert caught.value.kind == 'stale'
 
 
 # Arming
@@ -204,7 +205,7 @@ def test_every_way_out_of_armed_ends_torque_and_power(way: str, operate: Operate
     if way == 'emergency_stop':
         assert not bed.arm()[0]
         assert bed.testbed.reset()[0]
-        assert bed.testbed.gate.state is DeviceState.DISARMED
+        assert bed.testbed.arming.state is DeviceState.DISARMED
     assert bed.arm()[0]
     bed.tick()
     assert (bed.driven, bed.powered) == (NONE, OFF)
@@ -214,11 +215,11 @@ def test_failing_device_latches_a_fault(operate: Operate) -> None:
     bed = operate()
     bed.command(1e-5)
     bed.bench.breaks = True
-    with pytest.raises(FourbarError, match='bus is off'):
+    with pytest.raises(FourbarError):
         bed.tick()
     bed.bench.breaks = False
-    assert bed.testbed.gate.state is DeviceState.FAULT
-    assert bed.testbed.gate.reason == 'the bus is off'
+    assert bed.testbed.arming.state is DeviceState.FAULT
+    assert bed.testbed.arming.reason == 'the bus is off'
     bed.tick()
     assert (bed.driven, bed.powered) == (NONE, OFF)
     assert not bed.arm()[0]
@@ -254,7 +255,7 @@ def test_device_learns_at_once_that_it_has_no_power(way: str, operate: Operate) 
     else:
         getattr(bed.testbed, way)('test')
     assert [drive.powered.any() for drive in bed.bench.told] == [False]
-    assert bed.bench.gates[-1] is bed.testbed.gate.state is not DeviceState.ARMED
+    assert bed.bench.gates[-1] is bed.testbed.arming.state is not DeviceState.ARMED
     assert bed.bench.closed == (way == 'close')
 
 
@@ -288,7 +289,7 @@ def test_device_that_fails_to_take_a_command_latches_a_fault(operate: Operate) -
     bed = operate()
     bed.bench.breaks = True
     bed.command(1e-5)
-    assert (bed.testbed.gate.state, bed.testbed.gate.reason) == (
+    assert (bed.testbed.arming.state, bed.testbed.arming.reason) == (
         DeviceState.FAULT, 'the bus is off')
 
 
@@ -302,8 +303,8 @@ def test_finding_has_its_consequence(
     bed.command(1e-5)
     bed.bench.found = [DeviceFault(reaction, 'link_b is hot')]
     bed.tick()
-    assert bed.testbed.gate.state is state
-    assert (bed.testbed.gate.reason == 'link_b is hot') == (state is not DeviceState.ARMED)
+    assert bed.testbed.arming.state is state
+    assert (bed.testbed.arming.reason == 'link_b is hot') == (state is not DeviceState.ARMED)
     bed.bench.found = []
     bed.tick()
     assert bed.powered == (
@@ -325,8 +326,9 @@ def test_step_without_all_wheels_is_no_tick_that_anybody_could_answer(operate: O
     answered_ns = bed.stamp_ns
     bed.bench.complete = False
     bed.tick()
-    with pytest.raises(RejectedError, match='ahead'):
+    with pytest.raises(RejectedError) as caught:
         bed.command(1e-5)
+    assert caught.value.kind == 'stale'
     _, timing = bed.tick(periods=3.0)
     assert timing.lost == 0
     bed.testbed.command(
@@ -344,8 +346,8 @@ def test_watchdog_disarms_after_the_timeout(operate: Operate) -> None:
         assert bed.driven[0] == 1e-5
     bed.tick()
     assert bed.driven == NONE
-    assert bed.testbed.gate.state is DeviceState.DISARMED
-    assert bed.testbed.gate.reason == 'no flywheel_command for 0.1 s'
+    assert bed.testbed.arming.state is DeviceState.DISARMED
+    assert bed.testbed.arming.reason == 'no flywheel_command for 0.1 s'
     bed.command(1e-5)
     bed.tick()
     assert bed.driven == NONE
@@ -364,7 +366,7 @@ def test_wheels_keep_their_power_only_where_the_watchdog_parks_them(
         assert bed.powered == [True, False, False, False]
     for _ in range(3):
         bed.tick()
-        assert bed.testbed.gate.state is DeviceState.DISARMED
+        assert bed.testbed.arming.state is DeviceState.DISARMED
         assert bed.powered == [powered] * 4
     bed.testbed.emergency_stop('test')
     bed.tick()
@@ -375,9 +377,9 @@ def test_watchdog_waits_as_long_for_the_first_command(operate: Operate) -> None:
     bed = operate()
     for _ in range(25):
         bed.tick()
-    assert bed.testbed.gate.armed
+    assert bed.testbed.arming.armed
     bed.tick()
-    assert not bed.testbed.gate.armed
+    assert not bed.testbed.arming.armed
 
 
 def test_commands_in_time_keep_it_armed(operate: Operate) -> None:
@@ -385,21 +387,21 @@ def test_commands_in_time_keep_it_armed(operate: Operate) -> None:
     for _ in range(200):
         bed.command(1e-5)
         bed.tick()
-    assert bed.testbed.gate.armed
+    assert bed.testbed.arming.armed
 
 
 def test_frozen_stamps_do_not_disable_the_watchdog(operate: Operate) -> None:
     bed = operate()
     for _ in range(26):
         bed.tick(periods=1e-6, steady=1.0)
-    assert not bed.testbed.gate.armed
+    assert not bed.testbed.arming.armed
 
 
 def test_stamps_that_run_away_do_not_trip_the_watchdog(operate: Operate) -> None:
     bed = operate()
     for _ in range(25):
         bed.tick(periods=1000.0, steady=1.0)
-    assert bed.testbed.gate.armed
+    assert bed.testbed.arming.armed
 
 
 def test_rejected_commands_do_not_feed_the_watchdog(operate: Operate) -> None:
@@ -408,7 +410,7 @@ def test_rejected_commands_do_not_feed_the_watchdog(operate: Operate) -> None:
         bed.tick()
         with pytest.raises(RejectedError):
             bed.command(nan)
-    assert not bed.testbed.gate.armed
+    assert not bed.testbed.arming.armed
     assert bed.testbed.rejected == Counter(finite=26)
 
 
@@ -441,7 +443,7 @@ def left_alone(mechanism: Mechanism, action: str) -> tuple[list[Any], DeviceSupe
             # The last command lets them coast, so that they are steady when the watchdog comes.
             drive = [4e-5, -3e-5] if n < 39 else [0.0, 0.0]
             testbed.command(now, ['flywheel_a', 'flywheel_c'], [], [], drive, now)
-        if not testbed.gate.armed and n:
+        if not testbed.arming.armed and n:
             truths.append(samples.truth)
     assert len(truths) > 250
     return truths, testbed
@@ -469,7 +471,7 @@ def test_hold_speed_keeps_the_wheels_on_links_that_change_theirs(uneven: Mechani
     assert np.abs(speeds - speeds[0]).max() < bound
     # Without the loop they would stray by what the links do.
     assert np.abs(rates - rates[0]).max() > 5.0 * bound
-    assert testbed.gate.state is DeviceState.DISARMED
+    assert testbed.arming.state is DeviceState.DISARMED
     assert momentum(uneven, truths[-1]) == pytest.approx(momentum(uneven, truths[0]), rel=1e-11)
 
 
@@ -483,7 +485,7 @@ def test_brake_brings_the_wheels_to_rest(uneven: Mechanism) -> None:
     # with at least 20 of the loop's 30 rad/s. A rhombus keeps its link rates, so nothing is left.
     assert np.abs(speeds[0]).max() > 10.0
     assert np.abs(speeds[-1]).max() < np.abs(speeds[0]).max() * exp(-20.0 * 0.9)
-    assert testbed.gate.state is DeviceState.DISARMED
+    assert testbed.arming.state is DeviceState.DISARMED
     # All of their momentum is in the links now.
     assert momentum(still, truths[-1]) == pytest.approx(momentum(still, truths[0]), rel=1e-11)
 
@@ -544,7 +546,7 @@ def test_wheels_are_driven_only_when_allowed_and_within_limits(
     Armed it has power where the last command since then names the wheel, parking everywhere.
     """
     bed = operate(timeout_action=action)
-    gate = bed.testbed.gate
+    gate = bed.testbed.arming
     named = 0
     for name, value in events:
         before = gate.state
@@ -555,7 +557,7 @@ def test_wheels_are_driven_only_when_allowed_and_within_limits(
                 bed.bench.breaks = False
             torques = np.abs(bed.driven)
             assert torques.max() <= LIMIT
-            state, reason = bed.bench.gate_then
+            state, reason = bed.bench.arming_then
             parking = (action != 'coast' and state is DeviceState.DISARMED
                        and reason.startswith('no flywheel_command'))
             if torques.any():

@@ -14,10 +14,9 @@ from itertools import count
 from fourbar_ros.device import DeviceSupervisor, Samples, SupervisorSettings
 from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.hardware.dbc_codec import DbcCodec
-from fourbar_ros.hardware.emulator import ClockSettings, Emulator
-from fourbar_ros.hardware.firmware import FirmwareSettings
+from fourbar_ros.hardware.emulator import ClockSettings, Emulator, EmulatorSettings
 from fourbar_ros.hardware.messages import BusError, Codec, Frame
-from fourbar_ros.hardware.prototype import Prototype
+from fourbar_ros.hardware.prototype import Prototype, PrototypeSettings
 from fourbar_ros.hardware.safety_table import load_safety
 from fourbar_ros.mechanism import load_mechanism
 from fourbar_ros.plant import InitialState, load_table, Plant
@@ -39,7 +38,9 @@ class Wire:
     :ivar delays_ns: from and to: each way takes a random time between the two.
     :ivar loss: share of frames that get lost.
     :ivar broken: whether it is gone.
-    :ivar said: what the host said lately.
+    :ivar sent_frames: the last frames of the host.
+    :ivar lost_ids: identifiers whose frames to the host are lost.
+    :ivar opened_ns: when the host opened the bus, or tried to.
     """
 
     emulators: list[Emulator] = field(default_factory=list)
@@ -47,8 +48,10 @@ class Wire:
     delays_ns: tuple[int, int] = (60_000, 200_000)
     loss: float = 0.0
     broken: bool = False
-    trouble: str | None = None
-    said: deque[Frame] = field(default_factory=lambda: deque(maxlen=1000))
+    fault: str | None = None
+    lost_ids: set[int] = field(default_factory=set)
+    opened_ns: list[int] = field(default_factory=list)
+    sent_frames: deque[Frame] = field(default_factory=lambda: deque(maxlen=1000))
     sent: int = 0
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(1))
     _number: count[int] = field(default_factory=count)
@@ -59,7 +62,7 @@ class Wire:
         """Put a frame on its way."""
         if self.broken:
             raise BusError('the bus is gone')
-        self.said.append(frame)
+        self.sent_frames.append(frame)
         self.sent += 1
         self._push(self._to_links, frame, self.now_ns)
 
@@ -89,7 +92,7 @@ class Wire:
             if self._to_links and self._to_links[0][0] == next_ns:
                 _, _, frame = heappop(self._to_links)
                 for emulator in self.emulators:
-                    for answer in emulator.take(frame, next_ns):
+                    for answer in emulator.receive(frame, next_ns):
                         self._push(self._to_host, answer, next_ns)
             else:
                 for emulator in self.emulators:
@@ -97,10 +100,10 @@ class Wire:
                         self._push(self._to_host, said, next_ns)
 
     def inject(self, frame: Frame) -> None:
-        """Let somebody say something to the host."""
+        """Send a frame to the host."""
         self._push(self._to_host, frame, self.now_ns)
 
-    def facts(self) -> dict[str, object]:
+    def diagnostic_values(self) -> dict[str, object]:
         """Tell how much was said."""
         return {'frames_sent': self.sent}
 
@@ -108,7 +111,8 @@ class Wire:
         """Leave it as it is."""
 
     def _push(self, queue: list[tuple[int, int, Frame]], frame: Frame, now_ns: int) -> None:
-        if self.rng.random() >= self.loss:
+        if self.rng.random() >= self.loss and not (
+                queue is self._to_host and frame.frame_id in self.lost_ids):
             delay_ns = int(self.rng.integers(*self.delays_ns, endpoint=True))
             heappush(queue, (now_ns + delay_ns, next(self._number), frame))
 
@@ -122,16 +126,17 @@ class World:
 
     def __init__(self, codec: Codec | None = None, links: tuple[int, ...] = (0, 1, 2, 3),
                  table: str = 'prototype',
-                 settings: SupervisorSettings | None = None) -> None:
+                 settings: PrototypeSettings | None = None,
+                 supervisor: SupervisorSettings | None = None) -> None:
         self.codec = codec or DbcCodec('prototype')
         self.wire = Wire()
         self.samples: list[Samples] = []
         mechanism = load_mechanism('prototype')
         self.wire.emulators.append(self.emulator(links, table, seed=0))
         self.prototype = Prototype(
-            mechanism, self.open_bus, self.codec, load_safety('prototype'), PERIOD_NS, 2e-3,
-            False, lambda: self.wire.now_ns, self.stamp_of)
-        self.testbed = DeviceSupervisor(self.prototype, settings or SupervisorSettings())
+            mechanism, self.connect, self.codec, load_safety('prototype'),
+            settings or PrototypeSettings(), PERIOD_NS, lambda: self.wire.now_ns, self.stamp_of)
+        self.testbed = DeviceSupervisor(self.prototype, supervisor or SupervisorSettings())
         self.command: Callable[[], None] | None = None
         self._ticks = 0
 
@@ -142,12 +147,13 @@ class World:
                       InitialState(link_a=0.0, link_b=1.0, branch='open', rate_a=0.0, rate_b=0.0),
                       5e-4, np.random.default_rng(seed))
         return Emulator(
-            SimulatedTable(plant, 1_000_000), self.codec, links, FirmwareSettings(),
-            ClockSettings((100.0, 2000.0, 0.5, 50.0), DRIFTS), np.random.default_rng(seed),
-            now_ns, self.stamp_of(now_ns))
+            SimulatedTable(plant, 1_000_000), self.codec, links, EmulatorSettings(),
+            np.random.default_rng(seed), now_ns, self.stamp_of(now_ns),
+            ClockSettings((100.0, 2000.0, 0.5, 50.0), DRIFTS))
 
-    def open_bus(self) -> Wire:
-        """Return the wire if it is there."""
+    def connect(self) -> Wire:
+        """Return the wire unless it is broken."""
+        self.wire.opened_ns.append(self.wire.now_ns)
         if self.wire.broken:
             raise BusError('the bus is gone')
         return self.wire

@@ -309,7 +309,7 @@ def test_signals_of_the_lab_are_no_trouble(changed):
      {'message': 'LINK_A_COMMAND', 'signal': 'CHECKSUM'}),
     (r'CHECKSUM : 8\|8', 'CHECKSUM : 8|7',
      {'message': 'SYNC', 'signal': 'CHECKSUM', 'value': 7, 'limit': 8}),
-    (r'(LINK_A_COMMAND: [^B]*CHECKSUM : )56', r'\g<1>48',
+    (r'(LINK_A_COMMAND: [\s\S]*?CHECKSUM : )56', r'\g<1>48',
      {'message': 'LINK_A_COMMAND', 'signal': 'CHECKSUM'}),
     (r'SEQUENCE : 52\|4', 'SEQUENCE : 52|3',
      {'message': 'LINK_A_ANGLE', 'signal': 'SEQUENCE', 'value': 3, 'limit': 4}),

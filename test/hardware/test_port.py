@@ -125,7 +125,8 @@ def test_frames_go_through_and_are_counted(pair):
     assert [second.receive(PATIENCE_S)[0] for _ in frames] == frames
     assert second.receive(0.0) is None and second.receive(0.01) is None
     assert (first.sent, second.received, second.errors, second.dropped) == (4, 4, 0, 0)
-    assert first.facts()['frames_sent'] == 4 and 'bus_trouble' not in first.facts()
+    values = first.diagnostic_values()
+    assert values['frames_sent'] == 4 and 'bus_trouble' not in values
 
 
 def test_arrival_is_between_sending_and_receiving(pair):
@@ -181,16 +182,16 @@ def error_frame(kind, controller=0):
 def test_trouble_of_the_bus_is_told(stub):
     port = stub(error_frame(0x008), error_frame(0x004, 0x10), error_frame(0x004, 0x40),
                 error_frame(0x040))
-    assert port.trouble is None
+    assert port.fault is None
     for expected in ('1 error frames', 'error passive', '3 error frames'):
         # One at a time.
         messages, port._bus.messages = port._bus.messages[1:], port._bus.messages[:1]
         assert port.receive(0.0) is None
         port._bus.messages = messages
-        assert port.trouble.startswith(expected) and 'bit rate' in port.trouble
+        assert port.fault.startswith(expected) and 'bit rate' in port.fault
     with pytest.raises(BusError, match='^stub here: bus off: check wiring'):
         port.receive(0.0)
-    assert port.facts()['bus_trouble'] == port.trouble
+    assert port.diagnostic_values()['bus_trouble'] == port.fault
 
 
 @pytest.mark.parametrize('state, told', [
@@ -198,8 +199,8 @@ def test_trouble_of_the_bus_is_told(stub):
     (can.BusState.ERROR, 'bus off')])
 def test_state_of_the_bus_is_told_where_python_can_does(stub, monkeypatch, state, told):
     monkeypatch.setattr(StubBus, 'state', state)
-    trouble = stub().trouble
-    assert trouble is None if told is None else trouble.startswith(told)
+    fault = stub().fault
+    assert fault is None if told is None else fault.startswith(told)
 
 
 @pytest.mark.parametrize('error, told', [
@@ -276,7 +277,7 @@ def test_options_are_of_the_kind_they_look_like(request):
 def test_open_bus_of_datagrams():
     with open_port('fourbar_udp', '127.0.0.1:0', 1_000_000, 'peers=127.0.0.1:9') as port:
         assert port.receive(0.0) is None
-        assert port.facts()['datagrams_foreign'] == 0
+        assert port.diagnostic_values()['datagrams_foreign'] == 0
 
 
 @pytest.fixture
@@ -295,7 +296,7 @@ def test_line_that_says_half_a_frame_holds_nobody_up_and_is_heard_out(line):
             assert port.receive(0.0) is None
         os.write(line.far, said[12:] + said)
         assert [port.receive(PATIENCE_S)[0] for _ in range(2)] == [Frame(0x123, b'ab')] * 2
-        assert port.facts()['bytes_garbled'] == 0
+        assert port.diagnostic_values()['bytes_garbled'] == 0
 
 
 @pytest.mark.parametrize('noise', [
@@ -309,7 +310,7 @@ def test_noise_on_a_line_costs_no_frame_after_it(line, noise):
         os.write(line.far, said + noise + 20 * said)
         assert [port.receive(PATIENCE_S)[0] for _ in range(21)] == [Frame(0x123, b'ab')] * 21
         assert port.receive(0.0) is None
-        assert port.facts()['bytes_garbled'] == 1
+        assert port.diagnostic_values()['bytes_garbled'] == 1
 
 
 def test_line_that_is_pulled_out_is_told(line):
@@ -361,5 +362,5 @@ def test_python_can_still_tells_who_wants_to_know(request):
             logging.getLogger('can.bus').warning('something')
         finally:
             logging.getLogger('can').removeHandler(handler)
-        assert port.trouble is None
+        assert port.fault is None
     assert len(records) == 1

@@ -79,8 +79,8 @@ def test_lost_frames_are_counted_and_do_no_harm(world, loss: float) -> None:
     world.torque(1e-3, 1e-3, 1e-3, 1e-3)
     assert world.arm()[0]
     world.run(2.0)
-    assert world.testbed.gate.armed
+    assert world.testbed.arming.armed
     assert all(samples.complete for samples in world.samples[-500:])
-    facts = world.prototype.facts()
-    assert sum(facts.get(f'{name}.lost_angles', 0)
+    values = world.prototype.diagnostic_values()
+    assert sum(values.get(f'{name}.lost_angles', 0)
                for name in world.prototype.sensor_names) > 2000 * loss / 3

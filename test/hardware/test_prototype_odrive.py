@@ -56,10 +56,10 @@ def test_what_stops_it_does_so_as_before(world, trouble, state) -> None:
     world.torque(*TORQUE)
     assert world.arm()[0]
     world.run(0.2)
-    world.wire.emulators[0].trouble('link_d', trouble)
+    world.wire.emulators[0].inject_fault('link_d', trouble)
     world.run(1.0)
-    assert world.testbed.gate.state is state or not world.testbed.gate.armed
-    assert world.testbed.gate.reason.startswith('link_d: ')
+    assert world.testbed.arming.state is state or not world.testbed.arming.armed
+    assert world.testbed.arming.reason.startswith('link_d: ')
 
 
 def test_emergency_stop_holds_the_drivers_too(world) -> None:

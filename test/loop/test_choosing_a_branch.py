@@ -72,7 +72,7 @@ def test_it_goes_out_on_the_branch_that_is_named_and_comes_back(
         assert step.samples.truth is not None
         angles.append(step.samples.truth.link_angles)
         branches.append(loop.controller.branch)
-    assert loop.testbed.gate.armed
+    assert loop.testbed.arming.armed
     ends = [round((at + DURATION + REST - 0.1) * RATE) for at in begins]
     errors = np.degrees([wrap_angles(angles[end] - np.array(goal))
                          for end, goal in zip(ends, goals)])

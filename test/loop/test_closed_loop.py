@@ -91,7 +91,7 @@ def check_tracking(loop: ClosedLoop, steps: list[Step]) -> None:
     assert turned == pytest.approx(pi / 2, abs=2 * HALF_A_DEGREE)
     assert loop.controller.mode == 'hold'
     assert loop.controller.saturated == 0
-    assert loop.testbed.gate.armed
+    assert loop.testbed.arming.armed
     assert not loop.testbed.rejected
     assert not loop.estimator.rejected
     assert loop.estimator.starts == 1
@@ -151,7 +151,7 @@ def test_emergency_stop_in_motion_lets_the_wheels_coast(make_loop: MakeLoop) -> 
         loop.step()
     loop.testbed.emergency_stop('test')
     steps = [loop.step() for _ in range(500)]
-    assert loop.testbed.gate.state is DeviceState.EMERGENCY_STOP
+    assert loop.testbed.arming.state is DeviceState.EMERGENCY_STOP
     speeds = np.array([absolute_speeds(step) for step in steps])
     assert np.abs(speeds[0]).min() > 0.9 * PEAK
     np.testing.assert_allclose(speeds, speeds[0] + np.zeros((500, 4)), rtol=1e-14)

@@ -53,7 +53,7 @@ def run(loop: ClosedLoop, seed: int, seconds: float, loss: float, longest: int, 
             answer(loop, then_ns, then, stamp_ns)
         waiting.clear()
         # Early, when the estimator still knows little.
-        if not loop.testbed.gate.armed:
+        if not loop.testbed.arming.armed:
             loop.testbed.arm(stamp_ns, ())
         elif loop.controller.mode == 'hold' and tick % 100 == 0:
             up = 1.0 if tick % 200 else -1.0
@@ -63,7 +63,7 @@ def run(loop: ClosedLoop, seed: int, seconds: float, loss: float, longest: int, 
 
 def answer(loop: ClosedLoop, stamp_ns: int, samples: Samples, now_ns: int) -> None:
     """Let estimator and controller work on a tick, and the device take what comes of it."""
-    loop.controller.device_armed(loop.testbed.gate.armed)
+    loop.controller.device_armed(loop.testbed.arming.armed)
     with suppress(RejectedError):
         for sample in samples.links:
             loop.estimator.measure(

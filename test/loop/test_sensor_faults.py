@@ -95,7 +95,7 @@ def test_wheels_alone_carry_it_for_a_second_and_then_it_says_that_it_is_lost(
             lost_s = now_s - FASTEST_S
             assert 'lost' in loop.estimator.waiting_for
     assert 1.0 <= lost_s < 1.1
-    assert not loop.testbed.gate.armed
+    assert not loop.testbed.arming.armed
 
 
 def test_nobody_is_named_without_reason(scenario: Scenario) -> None:

@@ -53,7 +53,7 @@ def tracking(links: float, wheels: float, by: tuple[float, float]) -> Array:
             errors[tick] = step.control.reference_angles - step.samples.truth.link_angles
     assert loop.controller.mode == 'hold'
     assert loop.controller.saturated == 0
-    assert loop.testbed.gate.armed
+    assert loop.testbed.arming.armed
     return np.degrees(errors)
 
 

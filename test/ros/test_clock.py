@@ -113,7 +113,9 @@ def test_loop_goes_on_disarmed_when_a_node_was_restarted(nodes, suite, name):
     assert testbed.arm().success
     plant = f'{namespace[1:]}/plant'
     assert processes[name].end(signal.SIGINT) == 0
-    status = wait_for_summary(testbed, plant, f'waiting for {name}: nobody publishes')
+    topic = {'controller': 'flywheel_command', 'estimator': 'estimate/link_states'}[name]
+    status = wait_for_summary(
+        testbed, plant, f'waiting for {name}: {topic} has no publisher')
     assert status.level != b'\x00'
     suite.node(name, SIMULATED, namespace)
     assert 'joined' in testbed.status('device_status', state='disarmed')['reason']

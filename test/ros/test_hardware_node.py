@@ -11,7 +11,7 @@ import time
 from fourbar_ros.common.config_files import share_directory
 from fourbar_ros.hardware.can_port import open_port
 from fourbar_ros.hardware.dbc_codec import DbcCodec
-from fourbar_ros.hardware.emulator import LINK_TROUBLES
+from fourbar_ros.hardware.emulator import INJECTABLE_LINK_FAULTS
 from fourbar_ros.hardware.messages import Command
 from fourbar_ros.mechanism import LINK_NAMES
 from nav_msgs.msg import Odometry
@@ -388,7 +388,7 @@ def test_link_that_is_too_hot_ends_it_and_tells_how_hot(bench):
 def test_trouble_that_there_is_not_is_refused_with_a_list(bench):
     accepted, reason = bench.set('trouble.link_a', 'nonsense')
     assert not accepted
-    assert reason == (f'trouble of link_a must be one of {", ".join(LINK_TROUBLES)}, '
+    assert reason == (f'trouble of link_a must be one of {", ".join(INJECTABLE_LINK_FAULTS)}, '
                       "got 'nonsense'")
     found, = bench.probe.call(
         GetParameters, 'prototype_emulator/get_parameters',
