@@ -458,7 +458,7 @@ def _control_ticks(takes: Takes) -> Rival:
     mechanism = replace(scenario.mechanism, motor_torque_limits=np.full(4, WEAK_MOTORS))
     setpoint = scenario.setpoints[0]
     scenario = replace(
-        scenario, mechanism=mechanism, believed=mechanism, duration=setpoint.at + CONTROL_SECONDS,
+        scenario, mechanism=mechanism, model=mechanism, duration=setpoint.at + CONTROL_SECONDS,
         controller=replace(scenario.controller, allocation='bounded', command='velocity',
                            setpoint_timing='shortest'))
     given = [(step.samples.stamp_ns, step.estimate.link_angles, step.estimate.link_rates,

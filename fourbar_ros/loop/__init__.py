@@ -4,11 +4,11 @@
 """Device, estimator and controller stepped in one process, without ROS."""
 
 from fourbar_ros.loop.closed_loop import ClosedLoop, Step
-from fourbar_ros.loop.recording import Recording
 from fourbar_ros.loop.run import make_loop, record_run, run_scenario, RunError
+from fourbar_ros.loop.run_record import RunRecord
 from fourbar_ros.loop.scenario import load_scenario, Scenario, ScenarioError, ScriptedSetpoint
 
 __all__ = [
-    'ClosedLoop', 'load_scenario', 'make_loop', 'record_run', 'Recording', 'run_scenario',
-    'RunError', 'Scenario', 'ScenarioError', 'ScriptedSetpoint', 'Step',
+    'ClosedLoop', 'load_scenario', 'make_loop', 'record_run', 'run_scenario',
+    'RunError', 'RunRecord', 'Scenario', 'ScenarioError', 'ScriptedSetpoint', 'Step',
 ]

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The closed loop in one process: what the nodes do over topics, call by call.
+The closed loop in one process: the function calls that the nodes make over topics.
 
-The next tick comes when the command that answers the last one is there, so nothing is ever lost
-and time is simulated.
+Each tick waits for the command that answers the previous one, so no message is lost and time is
+simulated.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fourbar_ros.estimation import Estimate, Estimator
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Everything of one tick; without estimate or control while the estimator is starting."""
+    """Results of one tick; estimate and control are None while the estimator is starting."""
 
     samples: Samples
     estimate: Estimate | None
@@ -32,32 +32,32 @@ class Step:
 
 class ClosedLoop:
     """
-    A testbed with its estimator and controller.
+    A device with its estimator and controller.
 
-    :param testbed: the device behind its gate.
-    :param estimator, controller: made for the same mechanism.
+    :param supervisor: of the device.
+    :param estimator, controller: with the same model.
     """
 
-    def __init__(self, testbed: DeviceSupervisor, estimator: Estimator, controller: Controller
+    def __init__(self, supervisor: DeviceSupervisor, estimator: Estimator, controller: Controller
                  ) -> None:
-        self.testbed = testbed
+        self.supervisor = supervisor
         self.estimator = estimator
         self.controller = controller
         self._next_ns = FIRST_STAMP_NS
 
     def step(self) -> Step:
         """
-        Go through one tick: device, estimator, controller, command.
+        Run one tick: device, estimator, controller, command.
 
-        What one of them rejects it counts, and the others go on without it.
+        A rejected measurement or command is counted by the part that rejects it.
 
         :raises FourbarError: the device failed.
         """
         stamp_ns = self._next_ns
-        self._next_ns += self.testbed.device.period_ns
-        samples, _ = self.testbed.tick(stamp_ns, stamp_ns)
-        self.testbed.published(stamp_ns, 0)
-        self.controller.device_armed(self.testbed.arming.armed)
+        self._next_ns += self.supervisor.device.period_ns
+        samples, _ = self.supervisor.tick(stamp_ns, stamp_ns)
+        self.supervisor.published(stamp_ns, 0)
+        self.controller.device_armed(self.supervisor.arming.armed)
         for sample in samples.links:
             with suppress(RejectedError):
                 self.estimator.measure(
@@ -73,9 +73,9 @@ class ClosedLoop:
             samples.wheels.speeds, samples.wheels.efforts)
         names, velocities, efforts = by_name(control.command)
         with suppress(RejectedError):
-            self.testbed.command(stamp_ns, names, (), velocities, efforts, stamp_ns)
+            self.supervisor.command(stamp_ns, names, (), velocities, efforts, stamp_ns)
         return Step(samples, estimate, control)
 
     def arm(self) -> tuple[bool, str]:
-        """Arm the testbed at the last tick."""
-        return self.testbed.arm(self._next_ns - self.testbed.device.period_ns, ())
+        """Arm the device at the last tick: success and message."""
+        return self.supervisor.arm(self._next_ns - self.supervisor.device.period_ns, ())

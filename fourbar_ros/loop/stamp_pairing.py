@@ -1,21 +1,20 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Inputs that belong to the same tick, brought together by their stamp, in time or late."""
+"""Pairing of the inputs of a tick by their stamps, and detection of late ticks."""
 
 from __future__ import annotations
 
 from typing import Any
 
-# Ticks that may be incomplete at the same time.
 DEPTH = 16
-
-# Two clocks may drift apart so fast [s/s].
+"""Number of ticks that may be incomplete at the same time."""
 DRIFT = 1e-4
+"""Largest drift between the clock of the stamps and the monotonic clock [s/s]."""
 
 
 class StampPairs:
-    """Keep the halves of a pair until both are there; the middleware promises no order."""
+    """Keeps the first half of a pair until the second arrives; DDS promises no order of topics."""
 
     def __init__(self) -> None:
         self._halves: dict[int, dict[str, Any]] = {}
@@ -24,8 +23,8 @@ class StampPairs:
         """
         Add one half.
 
-        :param kind: which half.
-        :returns: both halves by kind if they are there now, and forgets this and older stamps.
+        :param kind: name of the half.
+        :returns: both halves by kind once both are known; this and older stamps are discarded.
         """
         pair = self._halves.setdefault(stamp_ns, {})
         pair[kind] = value
@@ -34,36 +33,36 @@ class StampPairs:
                             if stamp > stamp_ns}
             return pair
         if len(self._halves) > DEPTH:
-            # The oldest by arrival: a device that starts again may be behind in time.
+            # The oldest by arrival: a device that restarts may have older stamps.
             del self._halves[next(iter(self._halves))]
         return None
 
 
-class Punctuality:
+class LatenessDetector:
     """
-    Tells ticks that come late from those in time, by any clock that goes on steadily.
+    Detects ticks that arrive late.
 
-    Stamps may be of another clock: what counts is how much later than the earliest one comes.
+    Stamps may be of another clock: the delay of a tick is measured from the smallest delay so far.
     """
 
     def __init__(self) -> None:
-        self._earliest_ns: float | None = None
+        self._least_delay_ns: float | None = None
         self._stamp_ns = 0
         self._period_ns = 0
 
     def is_late(self, stamp_ns: int, monotonic_ns: int) -> bool:
         """
-        Tell whether a tick comes so late that the next one is due as well.
+        Return whether a tick arrives so late that the next one is due too.
 
         :param stamp_ns: of the tick [ns].
-        :param steady_ns: now [ns].
+        :param monotonic_ns: present time [ns].
         """
-        since_ns = stamp_ns - self._stamp_ns
+        elapsed_ns = stamp_ns - self._stamp_ns
         self._stamp_ns = stamp_ns
-        behind_ns = monotonic_ns - stamp_ns
-        if self._earliest_ns is None or since_ns <= 0:
-            self._earliest_ns, self._period_ns = behind_ns, 0
+        delay_ns = monotonic_ns - stamp_ns
+        if self._least_delay_ns is None or elapsed_ns <= 0:
+            self._least_delay_ns, self._period_ns = delay_ns, 0
             return False
-        self._period_ns = min(since_ns, self._period_ns or since_ns)
-        self._earliest_ns = min(behind_ns, self._earliest_ns + DRIFT * since_ns)
-        return behind_ns - self._earliest_ns > self._period_ns
+        self._period_ns = min(elapsed_ns, self._period_ns or elapsed_ns)
+        self._least_delay_ns = min(delay_ns, self._least_delay_ns + DRIFT * elapsed_ns)
+        return delay_ns - self._least_delay_ns > self._period_ns

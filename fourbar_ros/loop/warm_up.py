@@ -19,7 +19,7 @@ import numpy as np
 
 
 def warm_up() -> None:
-    """Go through a few ticks of a closed loop; the compiled code stays in the cache."""
+    """Run a few ticks of a closed loop; the compiled code stays in the cache."""
     mechanism = load_mechanism('paper')
     plant = Plant(mechanism, load_table('ideal'), InitialState(), 1e-3, np.random.default_rng(0))
     loop = ClosedLoop(
@@ -30,7 +30,7 @@ def warm_up() -> None:
 
 
 def main() -> None:
-    """Compile, and say so if there is something to compile."""
+    """Compile the kernels, and print a line if that takes long."""
     with announced(sys.stdout):
         warm_up()
 

@@ -21,7 +21,7 @@ from fourbar_ros.control.scalars import (
     momentum_scalars,
 )
 from fourbar_ros.control.wheel_command import by_name
-from fourbar_ros.loop.stamp_pairing import Punctuality, StampPairs
+from fourbar_ros.loop.stamp_pairing import LatenessDetector, StampPairs
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism
 from fourbar_ros.ros.base_node import BaseNode, run_node
 from fourbar_ros.ros.messages import (
@@ -62,7 +62,7 @@ class ControllerNode(BaseNode):
             load_mechanism(self.values['mechanism']), settings_from(self.values))
         self._pairs = StampPairs()
         # In simulated time the device waits for late nodes.
-        self._punctuality = None if self.simulated_time else Punctuality()
+        self._lateness = None if self.simulated_time else LatenessDetector()
         self._log = ThrottledLog(self)
         self._last_stamp_ns: int | None = None
         self._ticks = 0
@@ -125,8 +125,8 @@ class ControllerNode(BaseNode):
         pair = self._pairs.complete(stamp_ns, kind, value)
         if pair is None:
             return
-        late = (self._punctuality is not None
-                and self._punctuality.is_late(stamp_ns, monotonic_ns()))
+        late = (self._lateness is not None
+                and self._lateness.is_late(stamp_ns, monotonic_ns()))
         control = self._controller.tick(stamp_ns, *pair['links'], *pair['wheels'], late=late)
         wheels, velocities, efforts = by_name(control.command)
         if control.command.by_speed:

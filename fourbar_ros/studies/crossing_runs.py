@@ -110,8 +110,8 @@ def go(run: Run) -> Passage:
             assert truth is not None
             angles.append(truth.link_angles)
             torque = max(torque, float(np.abs(truth.efforts).max()))
-        if not loop.testbed.arming.armed:
-            reason = loop.testbed.arming.reason
+        if not loop.supervisor.arming.armed:
+            reason = loop.supervisor.arming.reason
     except FourbarError as failure:
         reason = str(failure)
     way = np.reshape(angles, (-1, 4))
@@ -131,7 +131,7 @@ def scenario_of(run: Run) -> Scenario:
     crossing = run.crossing
     rng = np.random.default_rng(run.seed)
     base = load_scenario('prototype')
-    believed = base.believed
+    believed = base.model
     inertias = believed.flywheel_inertias * (
         1.0 + rng.uniform(-INERTIA_SPREAD, INERTIA_SPREAD, 4))
     lengths = believed.link_lengths.copy()
@@ -158,7 +158,7 @@ def scenario_of(run: Run) -> Scenario:
         ScriptedSetpoint(at, LINK_NAMES[:2], (heading + phi_a, heading + phi_b), duration)
         for at, phi_a, phi_b, duration in crossing.script)
     return replace(
-        base, mechanism=mechanism, believed=believed, table=table,
+        base, mechanism=mechanism, model=believed, table=table,
         initial=InitialState(heading, heading + crossing.theta), controller=controller,
         estimator=replace(base.estimator, closure_tolerance=tolerance), setpoints=setpoints,
         duration=crossing.duration, seed=run.seed)

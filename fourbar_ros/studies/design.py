@@ -128,7 +128,7 @@ def closed_loop(mechanism: Mechanism, turn: tuple[float, float]) -> dict[str, fl
     """
     base = load_scenario('prototype')
     scenario: Scenario = replace(
-        base, mechanism=mechanism, believed=mechanism,
+        base, mechanism=mechanism, model=mechanism,
         setpoints=(ScriptedSetpoint(0.4, LINK_NAMES[:2], (turn[0], THETA + turn[1]), DURATION),))
     peaks, mean, error = np.zeros(4), 0.0, inf
     for step in run_scenario(scenario):

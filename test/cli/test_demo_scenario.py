@@ -31,12 +31,12 @@ def test_nodes_get_the_scenario_with_the_duration_of_its_setpoint(
     assert written == wanted
 
 
-def test_estimator_and_controller_get_the_believed_mechanism(tmp_path: Path) -> None:
+def test_estimator_and_controller_get_the_model(tmp_path: Path) -> None:
     content = yaml.safe_load((share_directory() / 'config' / 'scenario_paper.yaml').read_text())
     heavy = (share_directory() / 'config' / 'mechanism_paper.yaml').read_text().replace(
         '3.4e-7', '4.0e-7')
     (tmp_path / 'heavy.yaml').write_text(heavy)
-    (tmp_path / 'mine.yaml').write_text(yaml.safe_dump({**content, 'believed': './heavy.yaml'}))
+    (tmp_path / 'mine.yaml').write_text(yaml.safe_dump({**content, 'model': './heavy.yaml'}))
     _write_parameters(
         _one_move(str(tmp_path / 'mine.yaml')), 'simulated', tmp_path / 'parameters.yaml')
     written = yaml.safe_load((tmp_path / 'parameters.yaml').read_text())
@@ -74,7 +74,7 @@ def test_on_a_bus_the_parameters_of_the_plant_are_shared_out(tmp_path: Path) -> 
     assert set(written) == {'prototype_emulator', 'hardware', 'estimator', 'controller'}
     for node, values in written.items():
         rows = {row.name: row for row in TABLES[node]}
-        assert all(rows[name].checked(value) == value for name, value in values.items())
+        assert all(rows[name].check(value) == value for name, value in values.items())
     links, host = written['prototype_emulator'], written['hardware']
     assert links['bus.options'] == f'peers={host["bus.channel"]}'
     assert host['bus.options'] == f'peers={links["bus.channel"]}'

@@ -282,7 +282,7 @@ def test_closed_loop_table_is_the_recorded_run(tmp_path: Path) -> None:
     assert output.read_text() == ''.join(record_run(scenario).lines())
 
 
-def test_closed_loop_moves_the_mechanism_by_torques_for_the_believed_one(tmp_path: Path) -> None:
+def test_closed_loop_moves_the_mechanism_by_torques_for_the_model(tmp_path: Path) -> None:
     """Nothing of the table changes until the first torque, which comes after arm_at."""
     config = share_directory() / 'config'
     text = (config / 'scenario_paper.yaml').read_text()
@@ -290,7 +290,7 @@ def test_closed_loop_moves_the_mechanism_by_torques_for_the_believed_one(tmp_pat
         (config / 'mechanism_paper.yaml').read_text().replace('2.2e-5', '4.4e-5'))
     tables = {}
     for name in ('paper', './heavy.yaml'):
-        (tmp_path / 'mine.yaml').write_text(f'{text}\nbelieved: {name}\n')
+        (tmp_path / 'mine.yaml').write_text(f'{text}\nmodel: {name}\n')
         output = tmp_path / 'out.csv'
         assert main(['simulate', '--closed-loop', str(tmp_path / 'mine.yaml'), '--duration',
                      '0.6', '-o', str(output)]) == 0

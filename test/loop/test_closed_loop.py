@@ -91,8 +91,8 @@ def check_tracking(loop: ClosedLoop, steps: list[Step]) -> None:
     assert turned == pytest.approx(pi / 2, abs=2 * HALF_A_DEGREE)
     assert loop.controller.mode == 'hold'
     assert loop.controller.saturated == 0
-    assert loop.testbed.arming.armed
-    assert not loop.testbed.rejected
+    assert loop.supervisor.arming.armed
+    assert not loop.supervisor.rejected
     assert not loop.estimator.rejected
     assert loop.estimator.starts == 1
 
@@ -132,7 +132,7 @@ def test_crossed_branch_of_an_antiparallelogram(make_loop: MakeLoop) -> None:
 def momentum(loop: ClosedLoop, step: Step) -> float:
     truth = step.samples.truth
     assert truth is not None
-    return angular_momentum(loop.testbed.device.mechanism, truth.link_angles, truth.link_rates,
+    return angular_momentum(loop.supervisor.device.mechanism, truth.link_angles, truth.link_rates,
                             absolute_speeds(step))
 
 
@@ -149,9 +149,9 @@ def test_emergency_stop_in_motion_lets_the_wheels_coast(make_loop: MakeLoop) -> 
     loop.controller.setpoint(['link_a', 'link_b'], [pi / 2, pi / 3 + pi / 2])
     for _ in range(1250):
         loop.step()
-    loop.testbed.emergency_stop('test')
+    loop.supervisor.emergency_stop('test')
     steps = [loop.step() for _ in range(500)]
-    assert loop.testbed.arming.state is DeviceState.EMERGENCY_STOP
+    assert loop.supervisor.arming.state is DeviceState.EMERGENCY_STOP
     speeds = np.array([absolute_speeds(step) for step in steps])
     assert np.abs(speeds[0]).min() > 0.9 * PEAK
     np.testing.assert_allclose(speeds, speeds[0] + np.zeros((500, 4)), rtol=1e-14)
@@ -174,10 +174,10 @@ def test_run_again_after_an_emergency_stop(make_loop: MakeLoop) -> None:
     loop.controller.setpoint(['link_a', 'link_b'], [pi / 2, pi / 3 + pi / 2])
     for _ in range(600):
         loop.step()
-    loop.testbed.emergency_stop('test')
+    loop.supervisor.emergency_stop('test')
     for _ in range(100):
         loop.step()
-    assert loop.testbed.reset()[0]
+    assert loop.supervisor.reset()[0]
     assert loop.arm()[0]
     for _ in range(1000):
         step = loop.step()
@@ -219,7 +219,7 @@ def test_stamps_rise_by_one_period_and_answers_carry_them(make_loop: MakeLoop) -
         if step.estimate and step.control:
             assert step.estimate.stamp_ns == step.control.stamp_ns == step.samples.stamp_ns
     assert np.diff(stamps).tolist() == [PERIOD_NS] * 4
-    assert not loop.testbed.rejected
+    assert not loop.supervisor.rejected
 
 
 def test_unarmed_loop_does_not_move(make_loop: MakeLoop) -> None:

@@ -36,13 +36,13 @@ def run(loop: ClosedLoop, seed: int, seconds: float, loss: float, longest: int, 
     """
     rng = np.random.default_rng(seed)
     away, waiting = 0, deque[tuple[int, Samples]](maxlen=5)
-    for tick in range(round(seconds * 1e9 / loop.testbed.device.period_ns)):
-        stamp_ns = FIRST_STAMP_NS + tick * loop.testbed.device.period_ns
+    for tick in range(round(seconds * 1e9 / loop.supervisor.device.period_ns)):
+        stamp_ns = FIRST_STAMP_NS + tick * loop.supervisor.device.period_ns
         if device and away:
             away -= 1
             continue
-        samples, _ = loop.testbed.tick(stamp_ns, stamp_ns)
-        loop.testbed.published(stamp_ns, 0)
+        samples, _ = loop.supervisor.tick(stamp_ns, stamp_ns)
+        loop.supervisor.published(stamp_ns, 0)
         waiting.append((stamp_ns, samples))
         if away:
             away -= 1
@@ -53,8 +53,8 @@ def run(loop: ClosedLoop, seed: int, seconds: float, loss: float, longest: int, 
             answer(loop, then_ns, then, stamp_ns)
         waiting.clear()
         # Early, when the estimator still knows little.
-        if not loop.testbed.arming.armed:
-            loop.testbed.arm(stamp_ns, ())
+        if not loop.supervisor.arming.armed:
+            loop.supervisor.arm(stamp_ns, ())
         elif loop.controller.mode == 'hold' and tick % 100 == 0:
             up = 1.0 if tick % 200 else -1.0
             with suppress(SetpointError):
@@ -63,7 +63,7 @@ def run(loop: ClosedLoop, seed: int, seconds: float, loss: float, longest: int, 
 
 def answer(loop: ClosedLoop, stamp_ns: int, samples: Samples, now_ns: int) -> None:
     """Let estimator and controller work on a tick, and the device take what comes of it."""
-    loop.controller.device_armed(loop.testbed.arming.armed)
+    loop.controller.device_armed(loop.supervisor.arming.armed)
     with suppress(RejectedError):
         for sample in samples.links:
             loop.estimator.measure(
@@ -75,7 +75,7 @@ def answer(loop: ClosedLoop, stamp_ns: int, samples: Samples, now_ns: int) -> No
             stamp_ns, estimate.link_angles, estimate.link_rates, estimate.disturbance,
             samples.wheels.speeds, samples.wheels.efforts, late=now_ns > stamp_ns)
         names, velocities, efforts = by_name(control.command)
-        loop.testbed.command(stamp_ns, names, (), velocities, efforts, now_ns)
+        loop.supervisor.command(stamp_ns, names, (), velocities, efforts, now_ns)
 
 
 @pytest.mark.parametrize('preset', ['paper', 'prototype'])

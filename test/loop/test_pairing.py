@@ -3,7 +3,7 @@
 
 """Two halves of a tick find each other, whatever the order and whatever was lost."""
 
-from fourbar_ros.loop.stamp_pairing import DEPTH, Punctuality, StampPairs
+from fourbar_ros.loop.stamp_pairing import DEPTH, LatenessDetector, StampPairs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
@@ -90,8 +90,8 @@ def test_device_that_starts_again_at_an_earlier_time_is_paired_again(lost: int) 
 
 def lateness(delays_ms: list[float], drift: float = 0.0) -> list[bool]:
     """Let ticks come so late, by a clock that drifts and began at another time."""
-    punctuality = Punctuality()
-    return [punctuality.is_late(
+    lateness = LatenessDetector()
+    return [lateness.is_late(
         n * PERIOD, 10 ** 15 + round((n * PERIOD + delay * 1e6) * (1.0 + drift)))
         for n, delay in enumerate(delays_ms)]
 
@@ -108,7 +108,7 @@ def test_clocks_that_drift_apart_make_no_tick_late(drift: float) -> None:
 
 
 def test_clock_that_starts_anew_begins_with_a_tick_in_time() -> None:
-    punctuality = Punctuality()
-    assert not punctuality.is_late(10 ** 10, 0)
-    assert not punctuality.is_late(10 ** 9, 10 ** 12)
-    assert not punctuality.is_late(10 ** 9 + PERIOD, 10 ** 12 + PERIOD)
+    lateness = LatenessDetector()
+    assert not lateness.is_late(10 ** 10, 0)
+    assert not lateness.is_late(10 ** 9, 10 ** 12)
+    assert not lateness.is_late(10 ** 9 + PERIOD, 10 ** 12 + PERIOD)

@@ -12,9 +12,9 @@ from fourbar_ros.loop import (
     ClosedLoop,
     load_scenario,
     record_run,
-    Recording,
     run_scenario,
     RunError,
+    RunRecord,
     Scenario,
     ScriptedSetpoint,
     Step,
@@ -74,7 +74,7 @@ def strong_scenario() -> Scenario:
     scenario = load_scenario('paper')
     strong = replace(scenario.mechanism, motor_torque_limits=np.full(4, 1e-2),
                      motor_speed_limits=np.full(4, 5e4))
-    return replace(scenario, mechanism=strong, believed=strong)
+    return replace(scenario, mechanism=strong, model=strong)
 
 
 def test_script_acts_from_the_next_tick_on() -> None:
@@ -169,7 +169,7 @@ def test_what_was_not_there_stays_empty() -> None:
     partial = LinkSample(
         first_ns + 3_000_000, ('link_b', 'link_d'), np.array([1.0, 3.0]), np.empty(0))
     newer = LinkSample(first_ns + 5_000_000, ('link_b',), np.array([1.5]), np.empty(0))
-    recording = Recording()
+    recording = RunRecord()
     recording.add(replace(thinned(steps[0], ()), estimate=None, control=None))
     recording.add(thinned(steps[1], (partial,)))
     recording.add(thinned(steps[2], (partial, newer)))
@@ -219,7 +219,7 @@ def test_command_of_a_wheel_without_power_stays_empty() -> None:
     scenario = replace(load_scenario('prototype'), duration=0.02)
     steps = list(run_scenario(scenario))[-2:]
     values, powered = np.array([1.0, 2.0, 3.0, 4.0]), np.array([True, False, True, True])
-    recording = Recording(scenario.table.link_sensors.sensor_names)
+    recording = RunRecord(scenario.table.link_sensors.sensor_names)
     for by_speed, step in zip((False, True), steps):
         assert step.control is not None
         recording.add(replace(step, control=replace(

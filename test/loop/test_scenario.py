@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Scenario files: what they mean, and that whatever is wrong with them is told by its name."""
+"""Scenario files: their contents, their defaults, and errors that name key, value and limit."""
 
 from collections.abc import Callable
 from copy import deepcopy
@@ -14,7 +14,7 @@ from fourbar_ros.common.config_files import ConfigurationError, presets, share_d
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.loop import load_scenario, Scenario, ScenarioError
 from fourbar_ros.loop.description import describe, load_description
-from fourbar_ros.loop.scenario import ALLOWED, scenario_from
+from fourbar_ros.loop.scenario import scenario_from
 from fourbar_ros.mechanism import assemble
 from fourbar_ros.ros.parameters import TABLES
 import numpy as np
@@ -123,23 +123,40 @@ def test_relative_paths_begin_at_the_file(
 
 
 @pytest.mark.parametrize('name', ['paper', 'prototype'])
-def test_believed_is_the_mechanism_unless_told(name: str) -> None:
+def test_model_is_the_mechanism_by_default(name: str) -> None:
     scenario = load_scenario(name)
-    assert scenario.believed_name == scenario.mechanism_name == name
-    assert scenario.believed is scenario.mechanism
+    assert scenario.model_name == scenario.mechanism_name == name
+    assert scenario.model is scenario.mechanism
 
 
-def test_believed_may_be_another_preset_or_a_path_from_the_file(
+def test_old_key_of_the_model_is_read_and_reported_once(
+    written: Write, caplog: pytest.LogCaptureFixture,
+) -> None:
+    assert load_scenario(written({**GOOD, 'model': 'prototype'})).model_name == 'prototype'
+    assert caplog.messages == []
+    assert load_scenario(written({**GOOD, 'believed': 'prototype'})).model_name == 'prototype'
+    line, = caplog.messages
+    assert 'believed' in line
+    assert 'model' in line
+
+
+def test_both_keys_of_the_model_are_refused(written: Write) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(written({**GOOD, 'model': 'paper', 'believed': 'prototype'}))
+    assert caught.value.values['name'] == 'believed'
+
+
+def test_model_may_be_another_preset_or_a_path_from_the_file(
     written: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     (tmp_path / 'heavy.yaml').write_text(heavier_wheels())
     monkeypatch.chdir('/')
-    scenario = load_scenario(written({**GOOD, 'believed': './heavy.yaml'}))
+    scenario = load_scenario(written({**GOOD, 'model': './heavy.yaml'}))
     assert scenario.mechanism_name == 'paper'
-    assert scenario.believed_name == str(tmp_path / 'heavy.yaml')
+    assert scenario.model_name == str(tmp_path / 'heavy.yaml')
     assert scenario.mechanism.flywheel_inertias.tolist() == [3.4e-7] * 4
-    assert scenario.believed.flywheel_inertias.tolist() == [4e-7] * 4
-    assert load_scenario(written({**GOOD, 'believed': 'prototype'})).believed_name == 'prototype'
+    assert scenario.model.flywheel_inertias.tolist() == [4e-7] * 4
+    assert load_scenario(written({**GOOD, 'model': 'prototype'})).model_name == 'prototype'
 
 
 def heavier_wheels() -> str:
@@ -153,7 +170,7 @@ def heavier_wheels() -> str:
 def checked(parameters: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """Let the nodes' own tables check the values."""
     rows = {node: {row.name: row for row in table} for node, table in TABLES.items()}
-    return {node: {name: rows[node][name].checked(value) for name, value in values.items()}
+    return {node: {name: rows[node][name].check(value) for name, value in values.items()}
             for node, values in parameters.items()}
 
 
@@ -175,18 +192,18 @@ def test_parameters_say_what_the_file_says(written: Write) -> None:
     assert {values['mechanism'] for values in parameters.values()} == {'paper'}
 
 
-def test_plant_has_the_mechanism_and_the_others_the_believed_one(
+def test_plant_has_the_mechanism_and_the_others_the_model(
     written: Write, tmp_path: Path,
 ) -> None:
     (tmp_path / 'heavy.yaml').write_text(heavier_wheels())
-    parameters = load_scenario(written({**GOOD, 'believed': './heavy.yaml'})).parameters()
+    parameters = load_scenario(written({**GOOD, 'model': './heavy.yaml'})).parameters()
     assert {node: values['mechanism'] for node, values in parameters.items()} == {
         'plant': 'paper', 'estimator': str(tmp_path / 'heavy.yaml'),
         'controller': str(tmp_path / 'heavy.yaml')}
     assert checked(parameters) == parameters
 
 
-def test_what_is_left_out_and_what_is_allowed_is_as_in_the_nodes(written: Write) -> None:
+def test_defaults_are_those_of_the_nodes(written: Write) -> None:
     content: dict[str, Any] = {**GOOD, 'initial': {}, 'setpoints': []}
     for name in ('plant', 'estimator', 'controller'):
         del content[name]
@@ -201,40 +218,31 @@ def test_what_is_left_out_and_what_is_allowed_is_as_in_the_nodes(written: Write)
                 assert value == pytest.approx(rows[node, name].default, abs=1e-12), name
             else:
                 assert value == rows[node, name].default, name
-    for section, names in ALLOWED.items():
-        for name, allowed in names.items():
-            row = rows['plant', f'initial.{name}'] if section == 'initial' else (
-                rows[section, name])
-            if row.choices is not None:
-                assert allowed == row.choices, name
-            else:
-                assert allowed == (*row.limits, row.unit), name
 
 
 # Bad input
 
-def refused(path: str) -> str:
+def refused(path: str) -> dict[str, Any]:
+    """Return the values of the error with which a scenario file is refused."""
     with pytest.raises(ScenarioError) as caught:
         load_scenario(path)
     message = str(caught.value)
     assert message.startswith(f'{path}: ')
     assert len(message.splitlines()) == 1
-    return message
+    return caught.value.values
 
 
 @pytest.mark.parametrize('name', ['mechanism', 'table', 'initial', 'duration', 'seed'])
 def test_missing_key(name: str, written: Write) -> None:
-    assert f'{name} missing' in refused(written(changed(name, ...)))
+    assert refused(written(changed(name, ...)))['missing'] == [name]
 
 
-@pytest.mark.parametrize(('place', 'told'), [
-    ('seeed', 'seeed'), ('initial.link_c', 'initial: unknown link_c'),
-    ('plant.clock', 'plant: unknown clock'), ('estimator.noise', 'estimator: unknown noise'),
-    ('controller.gain', 'controller: unknown gain'),
-    ('setpoints.1.when', 'setpoints, entry 2: unknown when'),
-    ('setpoints.0.links.flywheel_a', 'setpoints, entry 1: links: unknown flywheel_a')])
-def test_unknown_key(place: str, told: str, written: Write) -> None:
-    assert told in refused(written(changed(place, 1.0)))
+@pytest.mark.parametrize('place', [
+    'seeed', 'initial.link_c', 'plant.clock', 'estimator.noise', 'controller.gain',
+    'setpoints.1.when', 'setpoints.0.links.flywheel_a'])
+def test_unknown_key(place: str, written: Write) -> None:
+    values = refused(written(changed(place, 1.0)))
+    assert values['unknown'] == [place.rpartition('.')[2]]
 
 
 @pytest.mark.parametrize('value', [nan, inf, -inf, 1e9, -1e9, 10 ** 400, 'x', None, [], True])
@@ -242,47 +250,64 @@ def test_unknown_key(place: str, told: str, written: Write) -> None:
     'initial.link_a', 'initial.rate_b', 'plant.rate', 'plant.step', 'plant.command_timeout',
     'estimator.angle_noise', 'controller.bandwidth', 'duration', 'setpoints.0.at',
     'setpoints.1.relative.link_d', 'setpoints.0.links.link_a'])
-def test_number_that_is_none_or_out_of_range(place: str, value: Any, written: Write) -> None:
-    message = refused(written(changed(place, value)))
-    name = place.rpartition('.')[2]
-    assert f'{name} must be' in message
+def test_number_of_another_type_or_out_of_range(place: str, value: Any, written: Write) -> None:
+    name = refused(written(changed(place, value)))['name']
     if place.startswith('setpoints'):
-        assert f'entry {int(place.split(".")[1]) + 1}' in message
+        _, index, *key = place.split('.')
+        assert name == f'setpoints, entry {int(index) + 1}: {".".join(key)}'
+    else:
+        assert name == place
 
 
-@pytest.mark.parametrize(('place', 'value', 'told'), [
-    ('seed', 1.5, 'seed must be a whole number'),
-    ('seed', -1, 'seed must be between 0'),
-    ('seed', 2 ** 63, 'seed must be between 0'),
-    ('arm_at', 2.5, 'arm_at must be between 0 and 2 s, got 2.5'),
-    ('arm_at', 'soon', 'arm_at must be a number'),
-    ('initial.branch', 'third', 'initial.branch must be one of open, crossed'),
-    ('initial.branch', 3, 'initial.branch must be one of open, crossed'),
-    ('plant.timeout_action', 'explode', 'plant.timeout_action must be one of coast'),
-    ('estimator.counts_per_turn', 0.5, 'estimator.counts_per_turn must be a whole number'),
-    ('plant', 3, 'plant must be a section'),
-    ('initial', [], 'initial must be a section'),
-    ('mechanism', 'papre', "no mechanism 'papre'"),
-    ('mechanism', 3, 'mechanism must be the name'),
-    ('believed', 'papre', "believed: no mechanism 'papre'"),
-    ('believed', './none.yaml', 'none.yaml: no such file'),
-    ('believed', 3, 'believed must be the name'),
-    ('table', './none.yaml', 'none.yaml: no such file'),
-    ('setpoints', 3, 'setpoints must be a list'),
-    ('setpoints', {}, 'setpoints must be a list'),
-    ('setpoints.1', 3, 'setpoints, entry 2 must have keys'),
-    ('setpoints.1.at', ..., 'setpoints, entry 2: at missing'),
-    ('setpoints.1.at', 0.5, 'setpoints, entry 2: at 0.5 s is not after entry 1, 0.5 s'),
-    ('setpoints.1.at', 2.5, 'setpoints, entry 2: at must be between 0 and 2 s'),
-    ('setpoints.0.at', 0.3, 'setpoints, entry 1: at 0.3 s is not a tick after arm_at 0.3 s'),
-    ('setpoints.1.links', {'link_a': 0.0}, 'setpoints, entry 2: give either links or relative'),
-    ('setpoints.1.relative', ..., 'setpoints, entry 2: give either links or relative'),
-    ('setpoints.1.relative', {}, 'setpoints, entry 2: relative must name links'),
-    ('setpoints.1.relative', 0.5, 'setpoints, entry 2: relative must name links'),
-    ('setpoints.1.duration', 0.0, 'setpoints, entry 2: duration must be between 0.1 and 3600 s'),
-    ('arm_at', ..., 'setpoints, entry 1: refused, the device is never armed')])
-def test_wrong_value(place: str, value: Any, told: str, written: Write) -> None:
-    assert told in refused(written(changed(place, value)))
+@pytest.mark.parametrize(('place', 'value', 'name', 'limit'), [
+    ('seed', 1.5, 'seed', int),
+    ('seed', -1, 'seed', (0, 2 ** 63 - 1)),
+    ('seed', 2 ** 63, 'seed', (0, 2 ** 63 - 1)),
+    ('arm_at', 2.5, 'arm_at', (0.0, 2.0)),
+    ('arm_at', 'soon', 'arm_at', float),
+    ('initial.branch', 'third', 'initial.branch', ('open', 'crossed')),
+    ('plant.timeout_action', 'explode', 'plant.timeout_action', ('coast', 'hold_speed', 'brake')),
+    ('estimator.counts_per_turn', 0.5, 'estimator.counts_per_turn', int),
+    ('plant', 3, 'plant', dict),
+    ('initial', [], 'initial', dict),
+    ('mechanism', 3, 'mechanism', str),
+    ('model', 3, 'model', str),
+    ('setpoints', 3, 'setpoints', list),
+    ('setpoints', {}, 'setpoints', list),
+    ('setpoints.1', 3, 'setpoints, entry 2', dict),
+    ('setpoints.1.relative', {}, 'relative', dict),
+    ('setpoints.1.relative', 0.5, 'relative', dict),
+    ('setpoints.1.at', 2.5, 'setpoints, entry 2: at', (0.0, 2.0)),
+    ('setpoints.1.duration', 0.0, 'setpoints, entry 2: duration', (0.1, 3600.0)),
+    # Not after the entry before, and not after arming.
+    ('setpoints.1.at', 0.5, 'at', 0.5),
+    ('setpoints.0.at', 0.3, 'at', 0.3)])
+def test_wrong_value(place: str, value: Any, name: str, limit: Any, written: Write) -> None:
+    values = refused(written(changed(place, value)))
+    assert (values['name'], values['value'], values['limit']) == (name, value, limit)
+
+
+@pytest.mark.parametrize('change', [
+    ('setpoints.1.links', {'link_a': 0.0}), ('setpoints.1.relative', ...)])
+def test_setpoint_has_either_links_or_relative(change: tuple[str, Any], written: Write) -> None:
+    assert refused(written(changed(*change)))['name'] == 'links or relative'
+
+
+def test_setpoint_without_its_time(written: Write) -> None:
+    assert refused(written(changed('setpoints.1.at', ...)))['missing'] == ['at']
+
+
+def test_setpoint_without_arming(written: Write) -> None:
+    assert refused(written(changed('arm_at', ...)))['missing'] == ['arm_at']
+
+
+@pytest.mark.parametrize('key', ['mechanism', 'model', 'table'])
+@pytest.mark.parametrize('name', ['papre', './none.yaml'])
+def test_preset_or_file_that_does_not_exist(key: str, name: str, written: Write) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(written(changed(key, name)))
+    assert Path(name).name in str(caught.value)
+    assert key in str(caught.value)
 
 
 def test_loop_that_cannot_close_at_the_start(written: Write, tmp_path: Path) -> None:
@@ -290,48 +315,44 @@ def test_loop_that_cannot_close_at_the_start(written: Write, tmp_path: Path) -> 
         (share_directory() / 'config' / 'mechanism_paper.yaml').read_text().replace(
             'link_lengths: [0.1, 0.1, 0.1, 0.1]', 'link_lengths: [0.3, 0.3, 0.1, 0.1]'))
     content = {**GOOD, 'mechanism': './m.yaml', 'initial': {'link_a': 0.0, 'link_b': 3.0}}
-    assert 'cannot close' in refused(written(content))
+    refused(written(content))
 
 
-@pytest.mark.parametrize(('old', 'new', 'told'), [
-    ('4.0e-7', '-4.0e-7', 'flywheel_inertias'), ('link_masses:', 'masses:', 'link_masses missing'),
+@pytest.mark.parametrize(('old', 'new', 'name'), [
+    ('4.0e-7', '-4.0e-7', 'flywheel_inertias'), ('link_masses:', 'masses:', 'link_masses'),
     (']', '', 'line 7')])
-def test_believed_mechanism_that_is_broken(
-    old: str, new: str, told: str, written: Write, tmp_path: Path,
+def test_broken_file_of_the_model(
+    old: str, new: str, name: str, written: Write, tmp_path: Path,
 ) -> None:
     (tmp_path / 'heavy.yaml').write_text(heavier_wheels().replace(old, new))
-    message = refused(written({**GOOD, 'believed': './heavy.yaml'}))
-    assert f'believed: {tmp_path / "heavy.yaml"}' in message
-    assert told in message
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(written({**GOOD, 'model': './heavy.yaml'}))
+    for part in ('model', str(tmp_path / 'heavy.yaml'), name):
+        assert part in str(caught.value)
 
 
 @pytest.mark.parametrize('text', ['', '- 1', 'a: [', 'seed: 1\nseed: 2\n'])
 def test_file_that_is_no_mapping(text: str, tmp_path: Path) -> None:
     (tmp_path / 'x.yaml').write_text(text)
-    with pytest.raises(ConfigurationError, match='x.yaml'):
+    with pytest.raises(ConfigurationError) as caught:
         load_scenario(str(tmp_path / 'x.yaml'))
+    assert 'x.yaml' in str(caught.value)
 
 
-def test_unknown_preset_names_those_there_are() -> None:
-    with pytest.raises(ConfigurationError, match='paper, prototype'):
+def test_unknown_preset_names_the_presets() -> None:
+    with pytest.raises(ConfigurationError) as caught:
         load_scenario('papre')
+    for name in presets('scenario'):
+        assert name in str(caught.value)
 
 
 @pytest.mark.parametrize('change', [
     {'seed': -1}, {'duration': 0.0}, {'duration': nan}, {'duration': 1e5}], ids=str)
 def test_replaced_values_are_checked_too(change: dict[str, Any], written: Write) -> None:
     scenario: Scenario = load_scenario(written(GOOD))
-    with pytest.raises(ScenarioError, match=f'{next(iter(change))} must be'):
+    with pytest.raises(ScenarioError) as caught:
         replace(scenario, **change)
-
-
-def test_table_of_what_is_allowed_is_whole() -> None:
-    """Nothing in the table of a section is without an entry in the settings, nor the reverse."""
-    scenario = load_scenario('paper')
-    for section in ALLOWED:
-        settings = getattr(scenario, section)
-        assert set(ALLOWED[section]) == set(settings.__dataclass_fields__)
-    assert np.isfinite(scenario.mechanism.link_lengths).all()
+    assert caught.value.values['name'] == next(iter(change))
 
 
 def plain(scenario: Scenario) -> dict[str, Any]:
@@ -353,32 +374,35 @@ def test_description_makes_the_same_scenario(name: str) -> None:
     assert describe(description, Path('nowhere')) == description
 
 
-def test_description_keeps_relative_setpoints_and_what_is_believed(written: Write) -> None:
-    description = load_description(written({**GOOD, 'believed': 'prototype'}))
+def test_description_keeps_relative_setpoints_and_the_model(written: Write) -> None:
+    description = load_description(written({**GOOD, 'model': 'prototype'}))
     assert description['setpoints'][1]['relative'] == {'link_d': -1}
     assert description['believed'] != description['mechanism']
     assert load_description(written(GOOD))['believed'] == description['mechanism']
 
 
-def test_nodes_are_not_given_what_a_scenario_describes_itself() -> None:
+def test_nodes_need_files_and_no_descriptions() -> None:
     description = load_description('paper')
-    with pytest.raises(ScenarioError, match='mechanism is described in the scenario itself'):
+    with pytest.raises(ScenarioError) as caught:
         scenario_from(description, Path()).parameters()
+    assert caught.value.values['name'] == 'mechanism'
 
 
-@pytest.mark.parametrize(('place', 'value', 'told'), [
-    ('mechanism.link_masses', [0.02, 0.02, 0.02, -1.0], 'link_masses of link_d'),
-    ('believed.link_masses', [0.02, 0.02, 0.02, -1.0], 'believed: .*link_masses of link_d'),
-    ('mechanism.weight', 1.0, 'mechanism: unknown weight'),
-    ('table.joints.coulomb', -1.0, 'table: joints.coulomb'),
+@pytest.mark.parametrize(('place', 'value', 'parts'), [
+    ('mechanism.link_masses', [0.02, 0.02, 0.02, -1.0], ['link_masses', 'link_d']),
+    ('believed.link_masses', [0.02, 0.02, 0.02, -1.0], ['believed', 'link_masses', 'link_d']),
+    ('mechanism.weight', 1.0, ['mechanism', 'weight']),
+    ('table.joints.coulomb', -1.0, ['table', 'joints.coulomb']),
 ])
-def test_what_is_wrong_in_a_described_mechanism_or_table_is_told(
-        place: str, value: Any, told: str) -> None:
+def test_error_in_a_described_mechanism_or_table_names_the_key(
+        place: str, value: Any, parts: list[str]) -> None:
     description = load_description('paper')
     *sections, name = place.split('.')
     section: Any = description
     for key in sections:
         section = section[key]
     section[name] = value
-    with pytest.raises(FourbarError, match=told):
+    with pytest.raises(FourbarError) as caught:
         scenario_from(description, Path())
+    for part in parts:
+        assert part in str(caught.value)

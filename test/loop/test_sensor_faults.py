@@ -65,7 +65,7 @@ def test_one_that_fails_does_little_and_is_named(
     named_s, worst = inf, 0.0
     for now_s, step in quarter_turn(loop):
         if now_s == FASTEST_S:
-            loop.testbed.device.break_down(name, Fault(name, kind, value))
+            loop.supervisor.device.break_down(name, Fault(name, kind, value))
         named = loop.estimator.sensor_faults()
         if now_s > 0.5:
             worst = max(worst, error_of(step))
@@ -88,14 +88,14 @@ def test_wheels_alone_carry_it_for_a_second_and_then_it_says_that_it_is_lost(
     for now_s, step in quarter_turn(loop):
         if now_s == FASTEST_S:
             for name in LINK_NAMES:
-                loop.testbed.device.break_down(name, Fault(name, 'off'))
+                loop.supervisor.device.break_down(name, Fault(name, 'off'))
         if 0.5 < now_s < FASTEST_S + 1.0:
             assert error_of(step) < LARGEST_ERROR, f'seed {seed}'
         if lost_s == inf and now_s > FASTEST_S and step.estimate is None:
             lost_s = now_s - FASTEST_S
             assert 'lost' in loop.estimator.waiting_for
     assert 1.0 <= lost_s < 1.1
-    assert not loop.testbed.arming.armed
+    assert not loop.supervisor.arming.armed
 
 
 def test_nobody_is_named_without_reason(scenario: Scenario) -> None:

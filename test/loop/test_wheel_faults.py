@@ -63,7 +63,7 @@ def tell(scenario: Scenario, command: str, at: float, *faults: Fault) -> Story:
         since = tick * PERIOD_S - at
         if tick == round(at / PERIOD_S):
             for fault in faults:
-                loop.testbed.device.break_down(fault.target, fault)
+                loop.supervisor.device.break_down(fault.target, fault)
         truth, control = step.samples.truth, step.control
         assert truth is not None
         if control is None:
@@ -175,7 +175,7 @@ def test_nobody_is_named_without_reason(command: str, scenario: Scenario) -> Non
             flywheel_inertias=real.flywheel_inertias * (1.0 + rng.choice([-0.05, 0.05], 4)))
         goal = (0.0, pi / 3.0 + pi / 4.0) if seed else (-pi / 2.0, -pi / 6.0)
         setpoint = replace(scenario.setpoints[0], names=LINK_NAMES[:2], positions=goal)
-        story = tell(replace(scenario, believed=believed, setpoints=(setpoint,), seed=seed),
+        story = tell(replace(scenario, model=believed, setpoints=(setpoint,), seed=seed),
                      command, 0.5)
         assert story.named == {}, f'seed {seed}'
         assert story.final < 0.1, f'seed {seed}'

@@ -45,7 +45,7 @@ def tracking(links: float, wheels: float, by: tuple[float, float]) -> Array:
             start[0] + by[0], start[1] + by[1]), DURATION),))
     wrong = replace(true, link_inertias=links * true.link_inertias,
                     flywheel_inertias=wheels * true.flywheel_inertias)
-    loop = ClosedLoop(make_loop(scenario).testbed, Estimator(true, scenario.estimator),
+    loop = ClosedLoop(make_loop(scenario).supervisor, Estimator(true, scenario.estimator),
                       Controller(wrong, scenario.controller))
     errors = np.full((scenario.ticks, 4), np.nan)
     for tick, step in enumerate(run_scenario(scenario, loop)):
@@ -53,7 +53,7 @@ def tracking(links: float, wheels: float, by: tuple[float, float]) -> Array:
             errors[tick] = step.control.reference_angles - step.samples.truth.link_angles
     assert loop.controller.mode == 'hold'
     assert loop.controller.saturated == 0
-    assert loop.testbed.arming.armed
+    assert loop.supervisor.arming.armed
     return np.degrees(errors)
 
 

@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from fourbar_ros.loop import load_scenario, make_loop, Recording
+from fourbar_ros.loop import load_scenario, make_loop, RunRecord
 import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
@@ -34,7 +34,7 @@ def stamp_of(message):
 def without_ros(scenario):
     """Run the same script in one process: arrays by topic and field."""
     loop = make_loop(scenario)
-    recording = Recording(scenario.table.link_sensors.sensor_names)
+    recording = RunRecord(scenario.table.link_sensors.sensor_names)
     for tick in range(BEFORE + BETWEEN + AFTER):
         if tick == BEFORE:
             assert loop.arm()[0]

@@ -115,7 +115,7 @@ def test_every_seed_draws_something_else_within_its_spread() -> None:
         assert np.count_nonzero(lengths) == 1
         longer.add((link, lengths[link] > 0.0))
         # The controller knows that joints give, and not what was drawn.
-        believed = scenario.believed
+        believed = scenario.model
         np.testing.assert_array_equal(believed.link_lengths, base.mechanism.link_lengths)
         np.testing.assert_array_equal(believed.flywheel_inertias, base.mechanism.flywheel_inertias)
         np.testing.assert_array_equal(believed.joint_stiffness, [hard.stiffness] * 4)
@@ -192,7 +192,7 @@ def goal_of(scenario: Scenario) -> Array:
 
 def test_end_counts_and_a_whole_turn_does_not(went: Callable[[Went], Passage]) -> None:
     def turned(scenario: Scenario, loop: Any) -> Iterable[Any]:
-        loop.testbed.arming.arm(0, ())
+        loop.supervisor.arming.arm(0, ())
         return [at(goal_of(scenario) + 2.0 * np.pi + 0.9 * crossing_runs.NEAR_GOAL)]
     found = went(turned)
     assert found.error == pytest.approx(0.9 * crossing_runs.NEAR_GOAL)
@@ -208,7 +208,7 @@ def test_end_that_is_none(
     """Of NEAR_GOAL; not a number is nowhere near."""
     def ended(scenario: Scenario, loop: Any) -> Iterable[Any]:
         if armed:
-            loop.testbed.arming.arm(0, ())
+            loop.supervisor.arming.arm(0, ())
         return [at(goal_of(scenario) + crossing_runs.NEAR_GOAL * np.array(off))]
     found = went(ended)
     assert not found.passed

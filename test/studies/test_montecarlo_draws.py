@@ -109,9 +109,9 @@ def test_what_is_drawn_enters_the_scenario() -> None:
         np.pi / 3.0 + drawn['setpoints[0].relative.link_b'], rel=1e-15)
     assert found.duration == drawn['duration']
     assert found.seed == made.seed_of(5)
-    assert found.believed.motor_resistances.tolist() == [1.0, 7.0, 1.0, 1.0]
+    assert found.model.motor_resistances.tolist() == [1.0, 7.0, 1.0, 1.0]
     # All else is nominal, what is believed above all.
-    assert (found.believed.flywheel_inertias == nominal.mechanism.flywheel_inertias).all()
+    assert (found.model.flywheel_inertias == nominal.mechanism.flywheel_inertias).all()
     assert found.mechanism.link_lengths.tolist() == nominal.mechanism.link_lengths.tolist()
     assert found.estimator == nominal.estimator
 
@@ -120,10 +120,10 @@ def test_believed_may_be_what_is_drawn() -> None:
     vary = {'mechanism.link_masses': {'uniform': [0.5, 0.7]},
             'believed.link_inertias': {'choice': [2.0], 'scale': True}}
     found = campaign(vary, believed='drawn').scenario(1)
-    assert found.believed.link_masses.tolist() == found.mechanism.link_masses.tolist()
-    assert found.believed.link_inertias == pytest.approx(2.0 * found.mechanism.link_inertias)
+    assert found.model.link_masses.tolist() == found.mechanism.link_masses.tolist()
+    assert found.model.link_inertias == pytest.approx(2.0 * found.mechanism.link_inertias)
     apart = campaign(vary).scenario(1)
-    assert apart.believed.link_masses.tolist() != apart.mechanism.link_masses.tolist()
+    assert apart.model.link_masses.tolist() != apart.mechanism.link_masses.tolist()
 
 
 def test_what_is_set_of_the_mechanism_is_believed_too() -> None:
@@ -133,7 +133,7 @@ def test_what_is_set_of_the_mechanism_is_believed_too() -> None:
     made = campaign(vary, set={'believed.link_masses.a': 0.4, **masses})
     found = made.scenario(0)
     assert found.mechanism.link_masses.tolist() == [0.5, 0.6, 0.7, 0.8]
-    assert found.believed.link_masses.tolist() == [0.4, 0.6, 0.7, 0.8]
+    assert found.model.link_masses.tolist() == [0.4, 0.6, 0.7, 0.8]
 
 
 def test_scenario_that_says_what_is_believed_keeps_it(tmp_path: Path) -> None:
@@ -144,7 +144,7 @@ def test_scenario_that_says_what_is_believed_keeps_it(tmp_path: Path) -> None:
                           'vary': {'initial.link_a': {'uniform': [0.0, 0.1]}}}, tmp_path)
     found = made.scenario(0)
     assert found.mechanism.link_masses.tolist() == [0.7, 0.6, 0.6, 0.6]
-    assert found.believed.link_masses.tolist() == [0.4, 0.4, 0.4, 0.4]
+    assert found.model.link_masses.tolist() == [0.4, 0.4, 0.4, 0.4]
 
 
 def test_mechanism_may_be_set_by_its_name() -> None:
@@ -153,7 +153,7 @@ def test_mechanism_may_be_set_by_its_name() -> None:
                     set={'mechanism': 'paper', 'table': 'ideal'})
     found, nominal = made.scenario(0), load_scenario('paper').mechanism
     assert found.mechanism.link_masses[0] == 2.0 * nominal.link_masses[0]
-    assert found.believed.link_masses.tolist() == nominal.link_masses.tolist()
+    assert found.model.link_masses.tolist() == nominal.link_masses.tolist()
 
 
 def test_grids_are_gone_through_once_each() -> None:

@@ -126,7 +126,7 @@ def measure(scenario: Scenario) -> tuple[dict[str, float | None], bool, str]:
     """
     loop = make_loop(scenario)
     steps = list(run_scenario(scenario, loop))
-    gate = loop.testbed.arming
+    gate = loop.supervisor.arming
     wanted = scenario.arm_at is not None
     return (_metrics(scenario, steps), gate.armed,
             gate.reason if wanted and not gate.armed else '')

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Everything that the nodes would publish in a run, as arrays and as a table."""
+"""Record of a run: the messages that the nodes would publish, as arrays and as a table."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ from fourbar_ros.mechanism.constants import Array
 import numpy as np
 from numpy.typing import NDArray
 
-QUALITY = ('nis', 'degrees_of_freedom')
-
+INNOVATION_STATISTICS = ('nis', 'degrees_of_freedom')
 LINKS = tuple('abcd')
-# Of the table: the beginning of the names of the columns, topic, field, and how the names end.
+# Columns of the table: prefix of their names, topic, field, and suffixes of their names.
 COLUMNS = (
     ('flywheel_angle_', names.FLYWHEEL_STATES, 'position', LINKS),
     ('flywheel_speed_', names.FLYWHEEL_STATES, 'velocity', LINKS),
@@ -35,7 +34,7 @@ COLUMNS = (
     ('sigma_link_', names.ESTIMATE_SIGMA, 'position', LINKS),
     ('sigma_rate_', names.ESTIMATE_SIGMA, 'velocity', LINKS),
     ('', names.ESTIMATE_INNOVATION, 'position',
-     (*QUALITY, *(f'innovation_{kind}{name}' for kind in ('', 'gyro_')
+     (*INNOVATION_STATISTICS, *(f'innovation_{kind}{name}' for kind in ('', 'gyro_')
                   for name in (*LINKS, *JOINT_NAMES)))),
     ('disturbance_', names.ESTIMATE_DISTURBANCE, 'position', ('a', 'b', 'sigma_a', 'sigma_b')),
     ('reference_link_', names.REFERENCE, 'position', LINKS),
@@ -47,17 +46,20 @@ COLUMNS = (
     ('command_speed_', names.FLYWHEEL_COMMAND, 'velocity', LINKS),
 )
 
+Arrays = dict[str, 'NDArray[np.float64] | NDArray[np.int64]']
 
-class Recording:
+
+class RunRecord:
     """
-    What was published at the ticks of a run.
+    Record of the messages of a run.
 
-    Fields go by `topic.field`: positions, velocities and efforts are (n, names) with one row per
-    message, in the order of names that the topic has, NaN for what a message left out;
-    `topic.stamp_ns` (n,) are the stamps, and `topic.tick_ns` (n,) the ticks they came with.
+    Arrays are named `topic.field`. Positions, velocities and efforts are (n, names): one row per
+    message, columns in the order of the names of the topic, NaN for a name that a message leaves
+    out. `topic.stamp_ns` (n,) are the stamps of the messages, and `topic.tick_ns` (n,) the stamps
+    of the ticks with which they were published.
 
-    :param sensor_names: of the sensors of the links, the order of `link_angles` here.
-    :ivar tick_stamps_ns: of all ticks so far [ns].
+    :param sensor_names: of the link-angle sensors, the order of columns of `link_angles`.
+    :ivar tick_stamps_ns: stamps of all recorded ticks [ns].
     """
 
     def __init__(self, sensor_names: Sequence[str] = LINK_NAMES) -> None:
@@ -67,7 +69,7 @@ class Recording:
         self._values: dict[str, tuple[int, array[float]]] = {}
 
     def add(self, step: Step) -> None:
-        """Take over what belongs to one tick."""
+        """Record the messages of one tick."""
         samples, now = step.samples, step.samples.stamp_ns
         self.tick_stamps_ns.append(now)
         for sample in samples.links:
@@ -91,10 +93,10 @@ class Recording:
                       velocity=estimate.rate_sigmas)
             self._row(names.ESTIMATE_DISTURBANCE, now, now, position=np.concatenate(
                 [estimate.disturbance, estimate.disturbance_sigmas]))
-            if (seen := estimate.innovation) is not None:
+            if (innovation := estimate.innovation) is not None:
                 self._row(names.ESTIMATE_INNOVATION, now, now, position=np.concatenate(
-                    [[seen.nis, seen.degrees_of_freedom],
-                     _spread(seen.sensors, seen.values, 2 * len(SENSOR_NAMES))]))
+                    [[innovation.nis, innovation.degrees_of_freedom],
+                     _spread(innovation.sensors, innovation.values, 2 * len(SENSOR_NAMES))]))
         if (control := step.control) is not None:
             self._command(now, control.command)
             self._row(names.REFERENCE, now, now, position=control.reference_angles,
@@ -103,51 +105,51 @@ class Recording:
                       velocity=control.rate_errors)
             self._row(names.ENERGY, now, now, position=control.energies)
 
-    def arrays(self) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]:
+    def arrays(self) -> Arrays:
         """Return copies of all arrays by name."""
-        found: dict[str, NDArray[np.float64] | NDArray[np.int64]] = {}
+        arrays: Arrays = {}
         for topic, (stamps, ticks) in self._stamps.items():
-            found[f'{topic}.stamp_ns'] = np.array(stamps, dtype=np.int64)
-            found[f'{topic}.tick_ns'] = np.array(ticks, dtype=np.int64)
+            arrays[f'{topic}.stamp_ns'] = np.array(stamps, dtype=np.int64)
+            arrays[f'{topic}.tick_ns'] = np.array(ticks, dtype=np.int64)
         for name, (width, values) in self._values.items():
-            found[name] = np.array(values).reshape(-1, width)
-        return found
+            arrays[name] = np.array(values).reshape(-1, width)
+        return arrays
 
     def table(self) -> tuple[tuple[str, ...], NDArray[np.float64]]:
         """
-        Arrange it by ticks.
+        Return a table with one row per tick.
 
-        Times count from the first tick [s]. Of several samples of a sensor at one tick the newest
-        counts. NaN where nothing was published.
+        Times count from the first tick [s]. Of several samples of a sensor at one tick the table
+        holds the newest. A value that was not published is NaN.
 
         :returns: names of the columns, and (ticks, columns).
         """
-        found = self.arrays()
+        arrays = self.arrays()
         ticks_ns = np.array(self.tick_stamps_ns, dtype=np.int64)
         first_ns = int(ticks_ns[0]) if len(ticks_ns) else 0
         titles = ['t']
         columns: list[Array] = [np.array(ticks_ns - first_ns, dtype=float)[:, None] / 1e9]
         sensors = len(self.sensor_names)
         measured = np.full((len(ticks_ns), 2 * sensors), np.nan)
-        rows = self._ticks_of(names.LINK_ANGLES, found)
+        rows = self._ticks_of(names.LINK_ANGLES, arrays)
         for n, row in enumerate(rows):
-            angles = found['link_angles.position'][n]
-            given = np.flatnonzero(~np.isnan(angles))
-            measured[row, given] = angles[given]
-            measured[row, sensors + given] = (found['link_angles.stamp_ns'][n] - first_ns) / 1e9
+            angles = arrays['link_angles.position'][n]
+            present = np.flatnonzero(~np.isnan(angles))
+            measured[row, present] = angles[present]
+            measured[row, sensors + present] = (arrays['link_angles.stamp_ns'][n] - first_ns) / 1e9
         titles += [f'measured_{name}' for name in self.sensor_names]
         titles += [f'measured_at_{name}' for name in self.sensor_names]
         columns.append(measured)
         for prefix, topic, field, ends in COLUMNS:
             titles += [f'{prefix}{end}' for end in ends]
             column = np.full((len(ticks_ns), len(ends)), np.nan)
-            if f'{topic}.{field}' in found:
-                column[self._ticks_of(topic, found)] = found[f'{topic}.{field}']
+            if f'{topic}.{field}' in arrays:
+                column[self._ticks_of(topic, arrays)] = arrays[f'{topic}.{field}']
             columns.append(column)
         return tuple(titles), np.hstack(columns)
 
     def lines(self) -> Iterator[str]:
-        """Write the table as CSV: 17 significant digits, nothing where there is no number."""
+        """Yield the lines of the table as CSV: 17 significant digits, NaN as an empty field."""
         titles, table = self.table()
         yield ','.join(titles) + '\n'
         for row in table:
@@ -155,17 +157,16 @@ class Recording:
             yield ','.join(['%.17g' % value if value == value else ''
                             for value in row.tolist()]) + '\n'
 
-    def _ticks_of(self, topic: str, found: dict[str, NDArray[np.float64] | NDArray[np.int64]]
-                  ) -> NDArray[np.intp]:
-        """Return the numbers of the ticks that the messages of a topic came with."""
+    def _ticks_of(self, topic: str, arrays: Arrays) -> NDArray[np.intp]:
+        """Return the index of the tick of each message of a topic."""
         return np.searchsorted(
-            np.array(self.tick_stamps_ns), found.get(f'{topic}.tick_ns', np.empty(0)))
+            np.array(self.tick_stamps_ns), arrays.get(f'{topic}.tick_ns', np.empty(0)))
 
     def _command(self, now: int, command: WheelCommand) -> None:
-        """Take over a command: efforts or velocities, of the wheels that have power."""
+        """Record a command: efforts or velocities of the powered wheels."""
         values = np.where(command.powered, command.values, np.nan)
-        nothing = np.full(len(values), np.nan)
-        efforts, velocities = (nothing, values) if command.by_speed else (values, nothing)
+        absent = np.full(len(values), np.nan)
+        efforts, velocities = (absent, values) if command.by_speed else (values, absent)
         self._row(names.FLYWHEEL_COMMAND, now, now, effort=efforts, velocity=velocities)
 
     def _row(self, topic: str, stamp_ns: int, tick_ns: int, **values: Array) -> None:
@@ -181,7 +182,7 @@ class Recording:
 
 
 def _spread(places: Sequence[int], values: Array, width: int) -> Array:
-    """Put values into their places among so many, NaN elsewhere."""
+    """Return an array of this width with values at their places, NaN elsewhere."""
     spread = np.full(width, np.nan)
     spread[list(places)] = values
     return spread
