@@ -312,7 +312,7 @@ def suspicion() -> Figure:
     times, samples, errors, sums = [], [], [], []
     for n in range(round((begin + 0.4) / 4e-3)):
         if n == round(begin / 4e-3):
-            loop.testbed.device.break_down('link_c', Fault('link_c', 'wrong', error))
+            loop.supervisor.device.break_down('link_c', Fault('link_c', 'wrong', error))
         step = loop.step()
         truth, estimate = step.samples.truth, step.estimate
         if n * 4e-3 < begin - 0.2 or truth is None or estimate is None:

@@ -154,10 +154,10 @@ class DeviceNode(BaseNode):
         :returns: its stamp [ns].
         :raises FourbarError: the clock is not paused, or no tick can be made now.
         """
-        gate = self._supervisor.arming
-        if gate.state is DeviceState.FAULT:
+        arming = self._supervisor.arming
+        if arming.state is DeviceState.FAULT:
             raise ClockModeError(
-                f'{gate.state.value} ({gate.reason}), call reset_emergency_stop first')
+                f'{arming.state.value} ({arming.reason}), call reset_emergency_stop first')
         stamp_ns = self.clock_mode.step(monotonic_ns())
         self._tick(stamp_ns)
         self.publish_status()
@@ -255,8 +255,8 @@ class DeviceNode(BaseNode):
             self.publish_status()
 
     def _report(self) -> Report:
-        gate = self._supervisor.arming
-        level, summary = LEVELS[gate.state], gate.state.value
+        arming = self._supervisor.arming
+        level, summary = LEVELS[arming.state], arming.state.value
         if self._rejected.update(self._supervisor.rejected.total()) and level == OK:
             level, summary = WARN, f'{summary}, commands were rejected'
         for text in filter(None, (self.stall_reason(), *self._supervisor.device.diagnostics())):
@@ -278,7 +278,7 @@ class DevicePublishers:
 
     def __init__(self, node: DeviceNode, supervisor: DeviceSupervisor, mechanism: str) -> None:
         self._node = node
-        self._gate = supervisor.arming
+        self._arming = supervisor.arming
         self._device = device = supervisor.device
         self._mechanism = mechanism
         self._published_state: tuple[DeviceState, str, int] | None = None
@@ -311,15 +311,15 @@ class DevicePublishers:
 
     def publish_status_changes(self) -> bool:
         """Publish device_status if the arming state changed; return whether it did."""
-        gate = self._gate
-        state = gate.state, gate.reason, gate.since_ns
+        arming = self._arming
+        state = arming.state, arming.reason, arming.since_ns
         if state == self._published_state:
             return False
         self._published_state = state
-        text = f'{gate.state.value}: {gate.reason}'
+        text = f'{arming.state.value}: {arming.reason}'
         self._status.publish(status_message(
-            self._node, self._device.description, LEVELS[gate.state], text, {
-                'state': gate.state.value, 'reason': gate.reason,
-                'since': f'{gate.since_ns * 1e-9:.9f}', 'mechanism': self._mechanism}))
+            self._node, self._device.description, LEVELS[arming.state], text, {
+                'state': arming.state.value, 'reason': arming.reason,
+                'since': f'{arming.since_ns * 1e-9:.9f}', 'mechanism': self._mechanism}))
         self._node.logger.info(text)
         return True
