@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The arming gate: whether the wheels may be driven, and why not."""
+"""Arming: the states in which the wheels may or may not be driven."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from enum import Enum
 
 
 class DeviceState(Enum):
-    """Whether the wheels may be driven; only `armed` lets torque through."""
+    """State of the device; the wheels may be driven only in `armed`."""
 
     DISARMED = 'disarmed'
     ARMED = 'armed'
@@ -20,13 +20,13 @@ class DeviceState(Enum):
 
 class Arming:
     """
-    A small state machine with one way to drive wheels and many ways to stop.
+    State machine of arming.
 
-    Emergency stop and fault are latched: only a reset leads out of them, and only to disarmed.
+    Emergency stop and fault are latched: only a reset ends them, and it leads to disarmed.
 
     :ivar state: present state.
-    :ivar reason: why it is in this state.
-    :ivar since_ns: stamp of the change [ns].
+    :ivar reason: reason of the last change.
+    :ivar since_ns: stamp of the last change [ns].
     """
 
     def __init__(self) -> None:
@@ -36,15 +36,15 @@ class Arming:
 
     @property
     def armed(self) -> bool:
-        """Tell whether torque may pass."""
+        """Whether the wheels may be driven."""
         return self.state is DeviceState.ARMED
 
     def arm(self, stamp_ns: int, arming_blockers: Sequence[str]) -> tuple[bool, str]:
         """
-        Ask to let torque through.
+        Arm, unless the state or another reason prevents it.
 
-        :param obstacles: what else speaks against it.
-        :returns: whether the gate is armed now, and why (not).
+        :param arming_blockers: other reasons.
+        :returns: whether the state is armed now, and the reason.
         """
         if self.armed:
             return True, 'already armed'
@@ -58,25 +58,25 @@ class Arming:
 
     def disarm(self, stamp_ns: int, reason: str, parked: bool = False) -> None:
         """
-        Stop driving; a latched state stays.
+        Disarm; a latched state stays.
 
-        :param parked: whether wheels had power though disarmed, so that there is something to end.
+        :param parked: whether wheels have power although disarmed; then the reason changes too.
         """
         if self.armed or (parked and self.state is DeviceState.DISARMED):
             self._enter(DeviceState.DISARMED, reason, stamp_ns)
 
     def emergency_stop(self, stamp_ns: int, reason: str) -> None:
-        """Stop driving until reset; the first reason is kept."""
+        """Latch an emergency stop; the first reason is kept."""
         if self.state is not DeviceState.EMERGENCY_STOP:
             self._enter(DeviceState.EMERGENCY_STOP, reason, stamp_ns)
 
     def fail(self, stamp_ns: int, reason: str) -> None:
-        """Stop driving because the device failed; an emergency stop stays what it is."""
+        """Latch a fault of the device; an emergency stop stays."""
         if self.state not in (DeviceState.EMERGENCY_STOP, DeviceState.FAULT):
             self._enter(DeviceState.FAULT, reason, stamp_ns)
 
     def reset(self, stamp_ns: int) -> tuple[bool, str]:
-        """Release emergency stop or fault; the wheels stay disarmed."""
+        """End emergency stop or fault; the device is disarmed then."""
         if self.state not in (DeviceState.EMERGENCY_STOP, DeviceState.FAULT):
             return True, f'nothing to reset: {self.state.value}'
         before = self.state.value

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Wheel commands as they come in: taken whole or rejected whole."""
+"""Conversion of wheel commands by name; a command is accepted or rejected as a whole."""
 
 from __future__ import annotations
 
@@ -13,22 +13,24 @@ from fourbar_ros.mechanism import FLYWHEEL_NAMES
 
 
 def drive_by_name(names: Sequence[str], positions: Sequence[float],
-                    velocities: Sequence[float], efforts: Sequence[float]) -> Drive:
+                  velocities: Sequence[float], efforts: Sequence[float]) -> Drive:
     """
-    Turn a command by wheel names into a drive.
+    Convert a command by wheel names to a drive.
 
-    :param names: wheels in any order, which are powered; one that is not named is not.
+    One of `velocities` and `efforts` must be empty.
+
+    :param names: wheels in any order; only these have power.
     :param positions: must be empty.
-    :param velocities: speed relative to the link for each name [rad/s], or
-    :param efforts: torque for each name [N m]: one of both, the other must be empty.
-    :raises RejectedError: anything else; kinds `fields`, `names`, `length`, `finite`.
+    :param velocities: speed relative to the link for each name [rad/s].
+    :param efforts: torque for each name [N m].
+    :raises RejectedError: of kind `fields`, `names`, `length` or `finite`.
     """
     if len(positions) or (len(velocities) and len(efforts)):
         raise RejectedError(
             'fields', 'position must be empty, and so must be one of velocity and effort')
     drive = no_torque()
-    given, field = (velocities, 'velocity') if len(velocities) else (efforts, 'effort')
-    for wheel, value in values_by_name(names, given, FLYWHEEL_NAMES, field).items():
+    values, field = (velocities, 'velocity') if len(velocities) else (efforts, 'effort')
+    for wheel, value in values_by_name(names, values, FLYWHEEL_NAMES, field).items():
         drive.values[wheel] = value
         drive.by_speed[wheel] = field == 'velocity'
         drive.powered[wheel] = True

@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 @dataclass(frozen=True, eq=False)
 class Drive:
     """
-    What the motors are asked for until the next tick.
+    Input of the motors until the next tick.
 
     :param values: (4,) torque [N m], or speed of the wheel relative to its link [rad/s].
-    :param by_speed: (4,) bool, which of both; speeds are followed by the motors' own electronics.
-    :param powered: (4,) bool, whose power stage is on; a wheel without power coasts, whatever its
-        value.
+    :param by_speed: (4,) bool, whether a value is a speed; the motor electronics control it.
+    :param powered: (4,) bool, whether a motor has power; without power the wheel coasts.
     """
 
     values: Array
@@ -34,7 +33,7 @@ class Drive:
 
 
 def no_torque() -> Drive:
-    """Let all wheels coast, without power."""
+    """Return the drive of coasting wheels, without power."""
     return Drive(np.zeros(4), np.zeros(4, dtype=bool), np.zeros(4, dtype=bool))
 
 
@@ -63,7 +62,7 @@ class WheelSample:
 
     :param angles: (4,) relative to the link, unwrapped [rad].
     :param speeds: (4,) relative to the link [rad/s].
-    :param efforts: (4,) torque really applied to the wheel [N m].
+    :param efforts: (4,) torque applied to the wheel [N m].
     """
 
     angles: Array
@@ -122,22 +121,22 @@ class Samples:
 
 
 class Reaction(IntEnum):
-    """What a finding leads to, the harder the higher."""
+    """Reaction to a fault, in the order of severity."""
 
     WARN = 0
-    """People are told."""
+    """Report in diagnostics only."""
     COAST = 1
-    """The device is disarmed, the wheels have no power."""
+    """Disarm: the wheels have no power."""
     STOP = 2
-    """As an emergency stop: likewise, until it is reset."""
+    """Emergency stop: the wheels have no power until a reset."""
 
 
 @dataclass(frozen=True)
 class DeviceFault:
     """
-    Something that is not as it should be.
+    A fault of the device.
 
-    :param text: what, where, and the limit.
+    :param text: subject, condition, value and limit.
     """
 
     reaction: Reaction
@@ -146,14 +145,14 @@ class DeviceFault:
 
 class Device(Protocol):
     """
-    A testbed.
+    A testbed, simulated or real.
 
-    :cvar description: what it is, for people.
+    :cvar description: name for messages.
     :cvar mechanism: the linkage, its wheels and motor limits.
     :cvar period_ns: time between two ticks [ns].
-    :cvar sensor_names: the sensors of the links, `link_a` and so on.
-    :cvar measures_rates: whether they have gyros.
-    :cvar timing_names: what the device itself knows of how it keeps time, with units.
+    :cvar sensor_names: the link-angle sensors, `link_a` and so on.
+    :cvar measures_rates: whether the sensors have gyros.
+    :cvar timing_names: names of the device's own timing values, with units.
     """
 
     description: str
@@ -165,7 +164,7 @@ class Device(Protocol):
 
     def step(self, stamp_ns: int, drive: Drive) -> Samples:
         """
-        Drive the wheels up to a tick, and report what was measured since the last one.
+        Drive the wheels up to a tick, and return the samples since the last one.
 
         :param stamp_ns: the tick; the first call only sets the time [ns].
         :param drive: within the motor limits.
@@ -174,42 +173,42 @@ class Device(Protocol):
 
     def drive(self, drive: Drive) -> None:
         """
-        Learn at once how the wheels shall be driven from now on; the next step says it again.
+        Apply a drive at once; the next step repeats it.
 
-        Nothing to do for a device that moves in its steps only.
+        A device that moves only in its steps does nothing.
 
         :raises FourbarError: the device failed and must not be driven.
         """
         return
 
     def arming_changed(self, state: DeviceState) -> None:
-        """Learn that the wheels may be driven now, or not any more, and why."""
+        """Take over a new arming state."""
         return
 
     def release(self) -> Sequence[str]:
         """
-        Let go of what the device holds by itself, whoever stopped it; asked for while disarmed.
+        End emergency stops in the device itself; called while disarmed.
 
-        :returns: names of what was held.
+        :returns: names of the parts that were stopped.
         """
         return ()
 
     def arming_blockers(self) -> Sequence[str]:
-        """Tell what speaks against arming now."""
+        """Return what prevents arming now."""
         return ()
 
     def faults(self) -> Sequence[DeviceFault]:
-        """Tell what was found at the last step that must have consequences."""
+        """Return the faults of the last step to which the supervisor must react."""
         return ()
 
     def diagnostics(self) -> dict[str, str]:
-        """Tell what is not as it should be, by what it is about; nothing if all is well."""
+        """Return present faults and warnings by subject."""
         return {}
 
     def diagnostic_values(self) -> dict[str, object]:
-        """Tell what a person wants to know when something is wrong, counters above all."""
+        """Return counters and measured states by name, for diagnostics."""
         return {}
 
     def close(self) -> None:
-        """Leave the wheels without power, and the device to others."""
+        """Switch the power of the wheels off, and close the connection to the device."""
         return

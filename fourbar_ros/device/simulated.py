@@ -21,7 +21,7 @@ from fourbar_ros.mechanism import FLYWHEEL_NAMES
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plant import Fault, InitialState, Plant
 from fourbar_ros.plant.energy_budget import EnergyBudget
-from fourbar_ros.plant.fault_schedule import FaultBoard, FaultChange
+from fourbar_ros.plant.fault_schedule import FaultBoard
 from fourbar_ros.plant.faults import WHEEL_FAULTS, wheel_faults
 from fourbar_ros.plant.step import conditions_of, SOUND
 import numpy as np
@@ -34,7 +34,7 @@ class SimulatedTable(Device):
 
     :param plant: what is simulated.
     :param period_ns: time between two ticks [ns].
-    :ivar injected_faults: what is broken; change it by `break_down` and `schedule_faults`.
+    :ivar injected_faults: present faults, set by `break_down` and `schedule_faults`.
     :raises PlantError: the period is not a whole multiple of the plant step.
     """
 
@@ -52,8 +52,8 @@ class SimulatedTable(Device):
         self._first_ns: int | None = None
         self._stamp_ns = 0
         self._conditions = SOUND
-        # What was asked for, newest first, with the step at which that began.
-        self._asked: deque[tuple[int, Drive]] = deque([(-1, no_torque())])
+        # The last drives, newest first, with the step at which each began.
+        self._drives: deque[tuple[int, Drive]] = deque([(-1, no_torque())])
         self._delays: NDArray[np.int64] | None = None
         self._longest_delay = round(WHEEL_FAULTS['delayed'].high * 1e9) // self._step_ns
         self._steps = 0
@@ -61,35 +61,35 @@ class SimulatedTable(Device):
 
     def reset(self, initial: InitialState) -> None:
         """
-        Put the linkage somewhere; time and faults go on.
+        Set the state of the linkage; time and faults continue.
 
-        :raises PlantError, ClosureError: it cannot be there; then nothing was changed.
+        :raises PlantError, ClosureError: the state is impossible; then nothing has changed.
         """
         self._plant.reset(initial)
         self._wheel_angles = self._wheel_angles_before()
 
     def break_down(self, target: str, fault: Fault | None) -> None:
         """
-        Break a sensor or a wheel from now on, or mend it with None.
+        Set the fault of a sensor or a wheel from now on, or clear it with None.
 
-        :raises FaultError: there is no such sensor or wheel.
+        :raises FaultError: unknown sensor or wheel.
         """
         self.injected_faults.set_fault(target, fault)
         self._apply_faults()
 
     def schedule_faults(self, entries: Any, origin: str) -> None:
         """
-        Let faults come and go by a schedule, in seconds since the first tick.
+        Load a schedule of faults, in seconds since the first tick.
 
-        :param entries: see plant.schedule.
-        :param origin: where they come from, for messages.
-        :raises FaultError: the schedule is refused; then nothing was changed.
+        :param entries: see `fourbar_ros.plant.fault_schedule`.
+        :param origin: name of the source, for messages.
+        :raises FaultError: the schedule is refused; then nothing has changed.
         """
         self.injected_faults.load(entries, origin, self._elapsed_ns)
         self._apply_faults()
 
     def step(self, stamp_ns: int, drive: Drive) -> Samples:
-        """Move the plant to the tick under a constant drive, and sample all sensors there."""
+        """Advance the plant to the tick under a constant drive, and sample all sensors there."""
         if self._first_ns is None:
             self._first_ns = self._stamp_ns = stamp_ns
             self._follow_schedule()
@@ -110,17 +110,17 @@ class SimulatedTable(Device):
                        TrueState(**vars(self._plant.truth(efforts))))
 
     def diagnostics(self) -> dict[str, str]:
-        """Tell what is broken, and whether the linkage has met the edge of the table."""
-        told = {}
+        """Return present faults, and whether the linkage has touched the edge of the table."""
+        texts = {}
         if self.injected_faults.faults:
-            told['faults'] = ', '.join(
+            texts['faults'] = ', '.join(
                 f'{target} {fault}' for target, fault in self.injected_faults.faults.items())
         if contacts := self._plant.contacts:
-            told['edge'] = f'the linkage has met the edge of the table, {contacts} contacts'
-        return told
+            texts['edge'] = f'the linkage has met the edge of the table, {contacts} contacts'
+        return texts
 
     def ledger(self) -> EnergyBudget:
-        """Draw up the accounts of energy and momentum since the start or the last reset."""
+        """Return the budget of energy and momentum since the start or the last reset."""
         return self._plant.ledger()
 
     @property
@@ -128,7 +128,7 @@ class SimulatedTable(Device):
         return 0 if self._first_ns is None else self._stamp_ns - self._first_ns
 
     def _move(self, steps: int, drive: Drive) -> Array:
-        """Advance, sampling the sensors whenever they are due; return the mean efforts."""
+        """Advance, and sample the sensors whenever they are due; return the mean efforts."""
         values, by_speed = self._commands(steps, drive)
         self._plant.disturb(steps * self._step_ns * 1e-9)
         efforts, done = np.zeros(4), 0
@@ -153,36 +153,34 @@ class SimulatedTable(Device):
 
     def _commands(self, steps: int, drive: Drive) -> tuple[Array, Any]:
         """
-        Return what the motors act on: the drive, or what was asked for some time ago.
+        Return the effective input of the motors: the drive, delayed for wheels with that fault.
 
-        Power is no command: it is switched at once, whatever the delay.
+        Power is switched without a delay.
         """
-        self._asked.appendleft((self._steps, drive))
-        while len(self._asked) > 1 and self._asked[-2][0] <= self._steps - self._longest_delay:
-            self._asked.pop()
+        self._drives.appendleft((self._steps, drive))
+        while len(self._drives) > 1 and self._drives[-2][0] <= self._steps - self._longest_delay:
+            self._drives.pop()
         delays = self._delays
         if delays is None:
             return drive.values, drive.by_speed
         values, by_speed = np.tile(drive.values, (steps, 1)), drive.by_speed.copy()
         for wheel in np.flatnonzero(delays):
-            past = [self._asked_at(self._steps + step - delays[wheel]) for step in range(steps)]
-            values[:, wheel] = [asked.values[wheel] for asked in past]
-            # From torque to speed, or back, within a period: at its begin.
+            past = [self._drive_at(self._steps + step - delays[wheel]) for step in range(steps)]
+            values[:, wheel] = [each.values[wheel] for each in past]
+            # A change between torque and speed acts from the begin of the period.
             by_speed[wheel] = past[0].by_speed[wheel]
-            values[[asked.by_speed[wheel] != by_speed[wheel] for asked in past], wheel] = (
+            values[[each.by_speed[wheel] != by_speed[wheel] for each in past], wheel] = (
                 past[0].values[wheel])
         return values, by_speed
 
-    def _asked_at(self, step: int) -> Drive:
-        """Return what was asked for at a step."""
-        return next((drive for since, drive in self._asked if since <= step),
-                    self._asked[-1][1])
+    def _drive_at(self, step: int) -> Drive:
+        """Return the drive at a step."""
+        return next((drive for since, drive in self._drives if since <= step),
+                    self._drives[-1][1])
 
-    def _follow_schedule(self) -> tuple[FaultChange, ...]:
-        changes = self.injected_faults.at_time(self._elapsed_ns)
-        if changes:
+    def _follow_schedule(self) -> None:
+        if self.injected_faults.at_time(self._elapsed_ns):
             self._apply_faults()
-        return changes
 
     def _apply_faults(self) -> None:
         present = self.injected_faults.faults
@@ -193,6 +191,6 @@ class SimulatedTable(Device):
         self._delays = delays if delays.any() else None
 
     def _wheel_angles_before(self) -> Array:
-        """Return what the encoders showed a period ago, had the wheels turned steadily [rad]."""
+        """Return the encoder readings one period ago, at constant wheel speeds [rad]."""
         return (self._plant.sense_wheels()
                 - self._plant.truth().wheel_speeds * (self.period_ns * 1e-9))

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A device behind its arming gate: commands are checked, watched, limited, and stopped.
+Supervision of a device: arming, checks and limits of commands, timeouts, reaction to faults.
 
-All times come in as arguments: `stamp_ns` is the time that messages carry, `monotonic_ns` a clock
-that nobody can set or freeze.
+All times are arguments: `stamp_ns` is the time scale of messages, `monotonic_ns` that of the
+watchdogs.
 """
 
 from __future__ import annotations
@@ -24,10 +24,8 @@ from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
 TIMEOUT_ACTIONS = ('coast', 'hold_speed', 'brake')
-
-
-# Ticks after which an answer is no longer waited for.
-LONGEST_WAIT = 100
+MAX_LATE_TICKS = 100
+"""Number of lost ticks whose late answers are still timed."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +55,12 @@ class SupervisorSettings(Settings):
 @dataclass(frozen=True)
 class Timing:
     """
-    How the loop around the device keeps time.
+    Timing of the control loop.
 
-    :param round_trip_s: from a tick to the command that answers it, None if none did [s].
-    :param command_age_s: how long ago the command now in force came, None if none is [s].
+    :param round_trip_s: from a tick to the command that answers it, None without a new one [s].
+    :param command_age_s: time since the last command, None before the first [s].
     :param lost: ticks that were not answered within one period, since the first answer.
-    :param step_s: time that the device needed for the last step [s].
+    :param step_s: duration of the last step of the device [s].
     """
 
     round_trip_s: float | None
@@ -73,12 +71,12 @@ class Timing:
 
 class DeviceSupervisor:
     """
-    One device, its gate, its watchdogs.
+    A device with arming and watchdogs.
 
-    :ivar gate: whether the wheels may be driven.
+    :ivar arming: whether the wheels may be driven.
     :ivar rejected: number of rejected commands by kind.
-    :ivar clipped: number of commands that asked more than a motor has.
-    :ivar last_rejection: what was wrong with the last rejected command, or ''.
+    :ivar clipped: number of commands beyond a motor limit.
+    :ivar last_rejection: reason of the last rejection, or ''.
     """
 
     def __init__(self, device: Device, settings: SupervisorSettings) -> None:
@@ -91,29 +89,29 @@ class DeviceSupervisor:
         self._drive = no_torque()
         self._parked: Drive | None = None
         self._wheel_speeds = np.zeros(4)
-        self._seen_ns: dict[str, int] = {}
-        self._known_state = self.arming.state
+        self._sample_ns: dict[str, int] = {}
+        self._reported_state = self.arming.state
         self._stamp_ns = 0
         self._tick_ns: int | None = None
-        # Ticks without an answer so far: when each went out, by stamp. Those that have waited for
-        # more than a period are counted as lost, but their round trip is still told if it ends.
+        # Time of publication of ticks without an answer, by stamp. After one period a tick counts
+        # as lost, but its round trip is still reported when the answer arrives.
         self._open_ticks: dict[int, int] = {}
         self._lost_ticks: dict[int, int] = {}
         self._step_ns = 0
         self._command_stamp_ns: int | None = None
-        self._command_steady_ns: int | None = None
-        self._armed_steady_ns = 0
+        self._command_ns: int | None = None
+        self._armed_ns = 0
         self._round_trip_ns: int | None = None
         self._lost = 0
 
     def tick(self, stamp_ns: int, monotonic_ns: int) -> tuple[Samples, Timing]:
         """
-        Drive the device up to a tick and sample it.
+        Step the device to a tick and sample it.
 
-        :raises FourbarError: the device failed; the gate is in `fault`, and stays there.
+        :raises FourbarError: the device failed; the state is `fault` until a reset.
         """
         timing = self._timing(monotonic_ns)
-        self._watch_commands(stamp_ns, monotonic_ns)
+        self._check_command_timeout(stamp_ns, monotonic_ns)
         try:
             samples = self.device.step(stamp_ns, self._present_drive())
         except FourbarError as error:
@@ -122,18 +120,18 @@ class DeviceSupervisor:
         self._stamp_ns = stamp_ns
         for sample in samples.links:
             for name in sample.names:
-                self._seen_ns[name] = max(sample.stamp_ns, self._seen_ns.get(name, 0))
+                self._sample_ns[name] = max(sample.stamp_ns, self._sample_ns.get(name, 0))
         if samples.complete:
             self._tick_ns = stamp_ns
             self._wheel_speeds = samples.wheels.speeds
-        self._heed()
+        self._react_to_faults()
         return samples, timing
 
     def published(self, monotonic_ns: int, step_ns: int) -> None:
         """
-        Note when the samples of the last tick went out.
+        Register the publication of the samples of the last tick.
 
-        :param step_ns: time that the device needed for it [ns].
+        :param step_ns: duration of the step of the device [ns].
         """
         if self._tick_ns is not None and self._tick_ns == self._stamp_ns:
             self._open_ticks[self._tick_ns] = monotonic_ns
@@ -142,12 +140,12 @@ class DeviceSupervisor:
     def command(self, stamp_ns: int, names: Sequence[str], positions: Sequence[float],
                 velocities: Sequence[float], efforts: Sequence[float], monotonic_ns: int) -> None:
         """
-        Take a wheel command, to act from the last tick on.
+        Accept a wheel command, which acts until the next one.
 
-        While armed it powers the wheels that it names, and no others.
+        While armed, only the wheels that it names have power.
 
-        :param stamp_ns: the tick that it answers [ns].
-        :raises RejectedError: it is rejected whole; also counted.
+        :param stamp_ns: stamp of the tick that it answers [ns].
+        :raises RejectedError: the whole command is rejected and counted.
         """
         try:
             self._check_stamp(stamp_ns)
@@ -162,59 +160,59 @@ class DeviceSupervisor:
         limited = np.clip(drive.values, -limits, limits)
         self.clipped += bool((limited != drive.values).any())
         if self._command_stamp_ns is None:
-            # Nobody was there yet to answer the ticks before this one.
+            # Ticks before the first command had no controller to answer them.
             self._open_ticks = {tick: published_ns for tick, published_ns
                                 in self._open_ticks.items() if tick >= stamp_ns}
         self._command_stamp_ns = stamp_ns
-        self._command_steady_ns = monotonic_ns
+        self._command_ns = monotonic_ns
         self._answered(stamp_ns, monotonic_ns)
         self._drive = replace(drive, values=limited)
         if self.arming.armed:
-            self._tell_device()
+            self._send_drive()
 
     def arm(self, monotonic_ns: int, arming_blockers: Sequence[str]) -> tuple[bool, str]:
         """
-        Ask to drive the wheels.
+        Arm the device, unless something prevents it.
 
-        :param obstacles: what speaks against it beyond what is known here.
-        :returns: whether it is armed now, and why (not).
+        :param arming_blockers: reasons beyond those of sensors and device.
+        :returns: whether the device is armed now, and the reason.
         """
         silent = [name for name in self.device.sensor_names
-                  if name not in self._seen_ns
-                  or self._now_ns - self._seen_ns[name] > self._settings.sensor_timeout * 1e9]
+                  if name not in self._sample_ns
+                  or self._stamp_ns - self._sample_ns[name] > self._settings.sensor_timeout * 1e9]
         if silent:
             arming_blockers = [*arming_blockers, f'no sample from {", ".join(silent)} for '
                                      f'{self._settings.sensor_timeout:g} s']
         arming_blockers = [*arming_blockers, *self.device.arming_blockers()]
         was_armed = self.arming.armed
-        armed, message = self.arming.arm(self._now_ns, arming_blockers)
+        armed, message = self.arming.arm(self._stamp_ns, arming_blockers)
         if armed and not was_armed:
-            self._armed_steady_ns = monotonic_ns
+            self._armed_ns = monotonic_ns
             self._parked = None
             self._drive = no_torque()
             self._arming_changed()
         return armed, message
 
     def disarm(self, reason: str) -> None:
-        """Stop driving: the wheels coast, without power."""
+        """Disarm: the wheels coast without power."""
         parked, self._parked = self._parked is not None, None
-        self.arming.disarm(self._now_ns, reason, parked)
+        self.arming.disarm(self._stamp_ns, reason, parked)
         self._arming_changed()
 
     def emergency_stop(self, reason: str) -> None:
-        """Stop driving until reset: the wheels coast, without power."""
+        """Disarm until a reset: the wheels coast without power."""
         self._parked = None
-        self.arming.emergency_stop(self._now_ns, reason)
+        self.arming.emergency_stop(self._stamp_ns, reason)
         self._arming_changed()
 
     def reset(self) -> tuple[bool, str]:
         """
-        Release emergency stop or fault, here and in the device; the wheels stay disarmed.
+        End emergency stop or fault, here and in the device; the wheels stay disarmed.
 
-        The device may be stopped though the gate is not: by an earlier host, or by others.
+        The device may be stopped although the supervisor is not, by another or an earlier host.
         """
         latched = self.arming.state in (DeviceState.EMERGENCY_STOP, DeviceState.FAULT)
-        answer = self.arming.reset(self._now_ns)
+        answer = self.arming.reset(self._stamp_ns)
         self._arming_changed()
         if self.arming.state is not DeviceState.DISARMED:
             return answer
@@ -224,12 +222,12 @@ class DeviceSupervisor:
         return answer
 
     def close(self) -> None:
-        """Leave the wheels without power, and the device to others."""
+        """Disarm and close the device."""
         self.disarm('the node ends')
         self.device.close()
 
     def diagnostics(self) -> dict[str, object]:
-        """Tell what a person wants to know when something is wrong."""
+        """Return states, counters and present faults by name."""
         return {
             'state': self.arming.state.value, 'reason': self.arming.reason,
             'ticks_lost': self._lost, 'commands_clipped': self.clipped,
@@ -238,37 +236,31 @@ class DeviceSupervisor:
                for kind, count in sorted(self.rejected.items())},
             **self.device.diagnostics(), **self.device.diagnostic_values()}
 
-    @property
-    def _now_ns(self) -> int:
-        """Return the stamp of the last step of the device, 0 before the first [ns]."""
-        return self._stamp_ns
-
     def _arming_changed(self) -> None:
-        """Let the device know at once, if it does not yet."""
-        if self.arming.state is self._known_state:
+        """Report a change of the arming state to the device."""
+        if self.arming.state is self._reported_state:
             return
-        self._known_state = self.arming.state
+        self._reported_state = self.arming.state
         self.device.arming_changed(self.arming.state)
-        self._tell_device()
+        self._send_drive()
 
-    def _tell_device(self) -> None:
+    def _send_drive(self) -> None:
         try:
             self.device.drive(self._present_drive())
         except FourbarError as error:
-            self._fail(self._now_ns, error)
+            self._fail(self._stamp_ns, error)
 
     def _fail(self, stamp_ns: int, error: FourbarError) -> None:
         self._parked = None
         self.arming.fail(stamp_ns, str(error))
-        self._known_state = self.arming.state
+        self._reported_state = self.arming.state
 
-    def _heed(self) -> None:
-        """Do what the findings of the device lead to."""
-        for finding in self.device.faults():
-            if finding.reaction is Reaction.STOP:
-                self.emergency_stop(finding.text)
-            elif finding.reaction is Reaction.COAST:
-                self.disarm(finding.text)
+    def _react_to_faults(self) -> None:
+        for fault in self.device.faults():
+            if fault.reaction is Reaction.STOP:
+                self.emergency_stop(fault.text)
+            elif fault.reaction is Reaction.COAST:
+                self.disarm(fault.text)
 
     def _check_stamp(self, stamp_ns: int) -> None:
         if self._tick_ns is None:
@@ -290,25 +282,25 @@ class DeviceSupervisor:
             self._round_trip_ns = monotonic_ns - self._lost_ticks.pop(stamp_ns)
 
     def _timing(self, monotonic_ns: int) -> Timing:
-        """Report the last answer, and give up on ticks that waited for more than a period."""
+        """Return the timing since the last tick, and count the ticks that are lost now."""
         overdue = [stamp_ns for stamp_ns, published_ns in self._open_ticks.items()
                    if monotonic_ns - published_ns > self.device.period_ns]
         for stamp_ns in overdue:
             self._lost_ticks[stamp_ns] = self._open_ticks.pop(stamp_ns)
             self._lost += self._command_stamp_ns is not None
-        while len(self._lost_ticks) > LONGEST_WAIT:
+        while len(self._lost_ticks) > MAX_LATE_TICKS:
             del self._lost_ticks[next(iter(self._lost_ticks))]
         round_trip_ns, self._round_trip_ns = self._round_trip_ns, None
         return Timing(
             round_trip_ns * 1e-9 if round_trip_ns is not None else None,
-            (monotonic_ns - self._command_steady_ns) * 1e-9
-            if self._command_steady_ns is not None else None,
+            (monotonic_ns - self._command_ns) * 1e-9
+            if self._command_ns is not None else None,
             self._lost, self._step_ns * 1e-9)
 
-    def _watch_commands(self, stamp_ns: int, monotonic_ns: int) -> None:
+    def _check_command_timeout(self, stamp_ns: int, monotonic_ns: int) -> None:
         if not self.arming.armed:
             return
-        last_ns = max(self._armed_steady_ns, self._command_steady_ns or 0)
+        last_ns = max(self._armed_ns, self._command_ns or 0)
         if monotonic_ns - last_ns > self._settings.command_timeout * 1e9:
             self.arming.disarm(
                 stamp_ns, f'no flywheel_command for {self._settings.command_timeout:g} s')

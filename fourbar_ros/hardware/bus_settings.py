@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How the prototype is reached: the parameters that host and emulator have in common."""
+"""Parameters of the bus and its protocol, common to host and emulator."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ CODECS = ('prototype', 'odrive')
 
 
 def bus_parameters(interface: str, channel: str, options: str) -> tuple[Setting, ...]:
-    """List the parameters of a bus; the arguments are defaults."""
+    """Return the declarations of the parameters; the arguments are defaults."""
     return (
         Setting('bus.interface', interface, '', 'interface of python-can, as socketcan, slcan, '
-                  'serial, udp_multicast, virtual or fourbar_udp'),
+                'serial, udp_multicast, virtual or fourbar_udp'),
         Setting('bus.channel', channel, '', 'channel of the interface, as can0 or HOST:PORT'),
-        Setting('bus.bitrate', 1_000_000, 'bit/s', 'of interfaces that have one',
-                  low=10_000, high=1_000_000),
+        Setting('bus.bitrate', 1_000_000, 'bit/s', 'bit rate, for interfaces that have one',
+                low=10_000, high=1_000_000),
         Setting('bus.options', options, '',
-                  'more for the interface, as key=value, with spaces between'),
-        Setting('codec', 'prototype', '', 'what is spoken on the bus', choices=CODECS),
-        Setting('dbc', 'prototype', '', 'preset or path of the DBC file of what is not of '
-                  'ODrive'),
+                'further options of the interface, as key=value, separated by spaces'),
+        Setting('codec', 'prototype', '', 'protocol on the bus', choices=CODECS),
+        Setting('dbc', 'prototype', '', 'preset or path of the DBC file of the messages of the '
+                'prototype'),
     )
 
 
 def open_bus(values: Mapping[str, Any]) -> Port:
     """
-    Open the bus that parameters describe.
+    Open the bus that the parameters describe.
 
-    :raises BusError: it cannot be.
+    :raises BusError: the bus cannot be opened.
     """
     return open_port(values['bus.interface'], values['bus.channel'], values['bus.bitrate'],
                      values['bus.options'])
@@ -46,10 +46,10 @@ def open_bus(values: Mapping[str, Any]) -> Port:
 
 def make_codec(values: Mapping[str, Any], mechanism: Mechanism) -> Codec:
     """
-    Make the codec that parameters name.
+    Return the codec that the parameters name.
 
-    :param mechanism: whose motors ODrives limit by their currents.
-    :raises FourbarError: the DBC file is not there or refused.
+    :param mechanism: has the torque constants, which ODrives need.
+    :raises FourbarError: the DBC file is missing or refused.
     """
     if values['codec'] == 'odrive':
         from fourbar_ros.hardware.odrive_codec import OdriveCodec
@@ -60,10 +60,10 @@ def make_codec(values: Mapping[str, Any], mechanism: Mechanism) -> Codec:
 
 
 def free_addresses(count: int) -> list[str]:
-    """Find addresses on this machine, as channels, that nobody uses now."""
+    """Return unused UDP addresses of this machine, as channels."""
     with ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
                    for _ in range(count)]
-        for one in sockets:
-            one.bind(('127.0.0.1', 0))
-        return [f'127.0.0.1:{one.getsockname()[1]}' for one in sockets]
+        for each in sockets:
+            each.bind(('127.0.0.1', 0))
+        return [f'127.0.0.1:{each.getsockname()[1]}' for each in sockets]

@@ -433,7 +433,7 @@ class DbcFile:
             raise DbcError(f'{self.path}: {error.strerror}', file=str(self.path)) from error
         except Exception as error:
             # The parser raises many kinds of errors for a malformed line.
-            raise DbcError(f'{self.path} is no usable DBC file: {" ".join(str(error).split())}',
+            raise DbcError(f'{self.path}: not a usable DBC file: {" ".join(str(error).split())}',
                            file=str(self.path)) from error
         self._messages: list[Message] = list(getattr(database, 'messages', ()))
 

@@ -2,88 +2,92 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The clock of a link, as the host reads it: offset and drift, from exchanges over the bus.
+Estimate of a link's clock against the host's: offset and drift, from exchanges over the bus.
 
-Each exchange bounds the link's time: what left the host at `sent` and was answered at `received`
-was with the link in between. In the middle, says the estimate, and that is wrong by half the way
-there and back at most; so an exchange counts the less, the longer it took beyond the shortest.
+The link reads its clock between the sending of a request and the arrival of the answer. The filter
+takes the middle of that interval as the time of the reading, with an error of at most half the
+round trip; the measurement variance grows with the excess over the shortest round trip.
 """
 
 from __future__ import annotations
 
 from math import sqrt
 
-# What the oscillators of two boards may differ by, to begin with [s/s], and how fast that wanders
-# with temperature [s/s per sqrt(s)].
-DRIFT, WANDER = 1e-4, 1e-7
-# How well a way there and back is halved at best [s], and as a share of the shortest: the two
-# directions differ. With this share an exchange that was slow one way only, and so is wrong by
-# half of its time, stays within the gate: it is never taken for another clock.
-FLOOR, SKEW = 2e-5, 0.1
-# A longer round trip than this says nothing that is worth having [s].
-LONGEST_ROUND_TRIP = 0.05
-# Exchanges after which stamps are to be trusted, and the standard deviation [s].
-ENOUGH, SURE = 4, 3e-4
-# Beyond so many standard deviations, so many times in a row, it is another clock: it started anew.
-GATE, ANOTHER_CLOCK = 6.0, 5
-# With which means of what is left are taken, and the shortest round trip is forgotten.
+INITIAL_DRIFT = 1e-4
+"""Initial standard deviation of the drift: tolerance of two quartz oscillators [s/s]."""
+DRIFT_RANDOM_WALK = 1e-7
+"""Random walk of the drift, by temperature [s/s per sqrt(s)]."""
+MIN_NOISE = 2e-5
+"""Smallest standard deviation of a measurement [s]."""
+ASYMMETRY = 0.1
+"""Standard deviation from unequal delays of the two directions, as a share of the shortest round
+trip. With this share an exchange that is slow in one direction only stays within the gate."""
+MAX_ROUND_TRIP = 0.05
+"""Longer exchanges are ignored [s]."""
+SETTLED_EXCHANGES, SETTLED_SIGMA = 4, 3e-4
+"""The estimate has settled after this number of exchanges, below this standard deviation [s]."""
+GATE = 6.0
+"""Innovation gate, in standard deviations."""
+RESTART_AFTER = 5
+"""Consecutive exchanges outside the gate after which the link's clock has restarted."""
 SMOOTHING, FORGETTING = 0.05, 1.002
+"""Weight of a new squared innovation in their mean; growth of the shortest round trip per
+exchange, so that it follows a bus that becomes slower."""
 
 
 class LinkClock:
     """
     Kalman filter of a link's clock against the host's.
 
-    :ivar exchanges: number of those that counted, since the clock last began.
-    :ivar restarts: how often it was another clock.
-    :ivar settled: whether its times are to be trusted; once they are they stay so, until it is
-        another clock.
+    :ivar exchanges: number of processed exchanges since the clock's last start.
+    :ivar restarts: number of restarts of the clock.
+    :ivar settled: whether the estimate can be used; it stays so until a restart.
     """
 
     def __init__(self) -> None:
         self.exchanges = 0
         self.restarts = 0
         self.settled = False
-        self._refused = 0
+        self._outside_gate = 0
         self._host_ns = 0
         self._link_us = 0
         # Error of the offset at the last exchange [s], drift, and their covariance.
         self._offset = 0.0
         self._drift = 0.0
         self._p00, self._p01, self._p11 = 0.0, 0.0, 0.0
-        self._shortest = LONGEST_ROUND_TRIP
-        self._residual = 0.0
+        self._shortest = MAX_ROUND_TRIP
+        self._innovation_square = 0.0
 
     @property
     def jitter(self) -> float:
-        """How far exchanges are from what the filter expects, root mean square [s]."""
-        return sqrt(self._residual)
+        """Root mean square of the innovations [s]."""
+        return sqrt(self._innovation_square)
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the offset at the last exchange, asymmetry apart [s]."""
+        """Standard deviation of the offset at the last exchange, without asymmetry [s]."""
         return sqrt(self._p00)
 
     @property
     def drift(self) -> float:
-        """How much faster than the host's it runs [s/s]."""
+        """Relative rate of the link's clock against the host's [s/s]."""
         return self._drift
 
     def exchange(self, sent_ns: int, received_ns: int, link_us: int) -> bool:
         """
-        Learn from a question and its answer.
+        Update the estimate by an exchange.
 
-        :param sent_ns, received_ns: host time [ns].
-        :param link_us: link time in between, not modulo anything [us].
-        :returns: whether it counted.
+        :param sent_ns, received_ns: host times of request and answer [ns].
+        :param link_us: unwrapped link time in between [us].
+        :returns: whether the exchange was used.
         """
         round_trip = (received_ns - sent_ns) * 1e-9
-        if not 0.0 <= round_trip <= LONGEST_ROUND_TRIP:
+        if not 0.0 <= round_trip <= MAX_ROUND_TRIP:
             return False
         middle_ns = (sent_ns + received_ns) // 2
         shortest = self._shortest * FORGETTING
         self._shortest = min(round_trip, shortest)
-        noise = FLOOR + SKEW * self._shortest + 0.5 * (round_trip - self._shortest)
+        noise = MIN_NOISE + ASYMMETRY * self._shortest + 0.5 * (round_trip - self._shortest)
         if not self.exchanges:
             self._begin(middle_ns, link_us, noise)
             return True
@@ -92,37 +96,38 @@ class LinkClock:
             return False
         offset = self._offset + elapsed * self._drift
         p00 = self._p00 + elapsed * (2.0 * self._p01 + elapsed * self._p11) + 1e-14 * elapsed
-        # Those before, all slower, may all have been wrong by half of what they took longer.
+        # Earlier exchanges were slower: all may have an error of half the difference.
         p00 += (0.5 * (shortest - self._shortest)) ** 2
         p01 = self._p01 + elapsed * self._p11
-        p11 = self._p11 + WANDER * WANDER * elapsed
-        # How far the link is ahead of where its clock would be at the host's pace.
-        error = (link_us - self._link_us) * 1e-6 - elapsed - offset
-        spread = p00 + noise * noise
-        if error * error > GATE * GATE * spread:
-            self._refused += 1
-            if self._refused >= ANOTHER_CLOCK:
+        p11 = self._p11 + DRIFT_RANDOM_WALK * DRIFT_RANDOM_WALK * elapsed
+        # Measured minus predicted offset; both are relative to the last exchange.
+        innovation = (link_us - self._link_us) * 1e-6 - elapsed - offset
+        innovation_variance = p00 + noise * noise
+        if innovation * innovation > GATE * GATE * innovation_variance:
+            self._outside_gate += 1
+            if self._outside_gate >= RESTART_AFTER:
                 self.restarts += 1
                 self._begin(middle_ns, link_us, noise)
             return False
-        self._refused = 0
-        gain0, gain1 = p00 / spread, p01 / spread
-        self._offset, self._drift = offset + gain0 * error, self._drift + gain1 * error
+        self._outside_gate = 0
+        gain0, gain1 = p00 / innovation_variance, p01 / innovation_variance
+        self._offset, self._drift = offset + gain0 * innovation, self._drift + gain1 * innovation
         self._p00, self._p01 = (1.0 - gain0) * p00, (1.0 - gain0) * p01
         self._p11 = p11 - gain1 * p01
-        self._residual += SMOOTHING * (error * error - self._residual)
-        # From here on, so that numbers stay small: whole microseconds move to the link's time.
+        self._innovation_square += SMOOTHING * (innovation * innovation - self._innovation_square)
+        # Move the reference to this exchange; whole microseconds go into the link time, so that
+        # the offset stays small.
         whole = round(self._offset * 1e6)
         ahead_us = round(elapsed * 1e6)
         self._offset += elapsed - ahead_us * 1e-6 - whole * 1e-6
         self._link_us += ahead_us + whole
         self._host_ns = middle_ns
         self.exchanges += 1
-        self.settled |= self.exchanges >= ENOUGH and self.sigma <= SURE
+        self.settled |= self.exchanges >= SETTLED_EXCHANGES and self.sigma <= SETTLED_SIGMA
         return True
 
     def host_ns(self, link_us: int) -> int:
-        """Return the host time of a link time, which is not modulo anything [ns]."""
+        """Return the host time of an unwrapped link time [ns]."""
         since = (link_us - self._link_us) * 1e-6 - self._offset
         return self._host_ns + round(since / (1.0 + self._drift) * 1e9)
 
@@ -133,15 +138,15 @@ class LinkClock:
 
     def unwrapped(self, time_us: int, wrap_us: int, about_ns: int) -> int:
         """
-        Return the link time that a time modulo `wrap_us` stands for.
+        Unwrap a link time modulo `wrap_us`.
 
-        :param about_ns: host time from which it is less than half of that away [ns].
+        :param about_ns: host time less than half a period away from it [ns].
         """
         about_us = self.link_us(about_ns)
         return about_us + (time_us - about_us + wrap_us // 2) % wrap_us - wrap_us // 2
 
     def _begin(self, host_ns: int, link_us: int, noise: float) -> None:
         self._host_ns, self._link_us = host_ns, link_us
-        self._offset = self._drift = self._residual = 0.0
-        self._p00, self._p01, self._p11 = noise * noise, 0.0, DRIFT * DRIFT
-        self._refused, self.exchanges, self.settled = 0, 1, False
+        self._offset = self._drift = self._innovation_square = 0.0
+        self._p00, self._p01, self._p11 = noise * noise, 0.0, INITIAL_DRIFT * INITIAL_DRIFT
+        self._outside_gate, self.exchanges, self.settled = 0, 1, False

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A bus over a serial line: one CAN frame in some bytes, as python-can's interface `serial` has them.
+CAN frames over a serial line, in the format of python-can's interface `serial`.
 
 A frame is 0xAA, a time of the sender in 4 bytes, the length code, the identifier in 4 bytes with
-flags on top (extended, remote, error), the data and 0xBB; low bytes come first, and a remote frame
-has no data. python-can's own reader waits for a fixed time, whatever it is asked for, and fails at
-a byte that is wrong; this one waits as long as it shall, and looks for the next frame.
+flags in the high bits (extended, remote, error), the data and 0xBB. Low bytes come first; a remote
+frame has no data. Unlike python-can's own class, this one observes the timeout of a receive call
+and finds the next frame after a wrong byte.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _HEADER = Struct('<BIBI')
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 _LONG, _SHORT = (1 << 29) - 1, (1 << 11) - 1
 
-# What one look takes from the line at most [bytes].
 _CHUNK = 4096
-# A line that takes nothing for so long has nobody at its other end, or is too slow [s].
+"""Largest number of bytes per read."""
 _WRITE_TIMEOUT_S = 0.05
+"""Longest time of a write; then the line is not connected or too slow [s]."""
 
 
 class SerialBus(can.BusABC):
@@ -37,11 +37,11 @@ class SerialBus(can.BusABC):
     :param channel: the device, as `/dev/ttyUSB0`.
     :param baudrate: [bit/s].
     :param rtscts: whether the line has hardware handshake.
-    :param bitrate: of no consequence here.
-    :ivar garbled: number of places where bytes were no frame.
+    :param bitrate: ignored.
+    :ivar garbled: number of sequences of bytes that are no frame.
     :raises can.CanInterfaceNotImplementedError: pyserial is not installed.
     :raises OSError: no such device, or it is in use.
-    :raises ValueError: a baud rate that the device does not have.
+    :raises ValueError: the device does not support the baud rate.
     """
 
     def __init__(self, channel: str, baudrate: int = 115_200, rtscts: bool = False,
@@ -53,8 +53,8 @@ class SerialBus(can.BusABC):
         self.garbled = 0
         self.channel_info = f'serial {channel}'
         self._bytes = bytearray()
-        self._lost = False
-        # Exclusive: two readers would take each other's bytes.
+        self._skipping = False
+        # Exclusive, since two readers would each receive only a part of the bytes.
         self._line: Any = serial.Serial(
             channel, baudrate, timeout=0.0, write_timeout=_WRITE_TIMEOUT_S, rtscts=rtscts,
             exclusive=True)
@@ -64,9 +64,9 @@ class SerialBus(can.BusABC):
         """
         Send a frame.
 
-        :param timeout: not used: it waits until the line has taken it, for 50 ms at most.
-        :raises can.CanOperationError: it is no classic frame.
-        :raises OSError: the line takes nothing, or is gone.
+        :param timeout: not used; a write takes at most 50 ms.
+        :raises can.CanOperationError: not a classic frame.
+        :raises OSError: the line accepts no data, or is disconnected.
         """
         if msg.is_fd or msg.dlc > 8:
             raise can.CanOperationError('serial carries classic CAN frames only')
@@ -76,7 +76,7 @@ class SerialBus(can.BusABC):
         self._line.write(_HEADER.pack(_BEGIN, 0, msg.dlc, frame_id) + data + bytes((_END,)))
 
     def fileno(self) -> int:
-        """Return the descriptor to wait at."""
+        """Return the file descriptor for `select`."""
         return int(self._line.fileno())
 
     def shutdown(self) -> None:
@@ -96,18 +96,18 @@ class SerialBus(can.BusABC):
                 message = self._message()
                 if message is not None:
                     return message, False
-            left = None if deadline is None else deadline - monotonic()
-            if left is not None and left <= 0.0:
+            remaining = None if deadline is None else deadline - monotonic()
+            if remaining is not None and remaining <= 0.0:
                 return None, False
-            select((self._line,), (), (), left)
+            select((self._line,), (), (), remaining)
 
     def _message(self) -> can.Message | None:
-        """Take the next frame from what came, if all of it is there."""
+        """Return the next complete frame from the received bytes."""
         data = self._bytes
         while data:
             if data[0] != _BEGIN:
-                if not self._lost:
-                    self.garbled, self._lost = self.garbled + 1, True
+                if not self._skipping:
+                    self.garbled, self._skipping = self.garbled + 1, True
                 begin = data.find(_BEGIN)
                 del data[:begin if begin >= 0 else len(data)]
                 continue
@@ -120,15 +120,15 @@ class SerialBus(can.BusABC):
             frame_id = flagged & _LONG
             highest = _LONG if flagged & (_EXTENDED | _ERROR) else _SHORT
             if dlc > 8 or data[end] != _END or frame_id > highest:
-                # That was no begin: there may be one in what was taken for a frame.
-                if not self._lost:
-                    self.garbled, self._lost = self.garbled + 1, True
+                # Not the begin of a frame; one may begin within these bytes.
+                if not self._skipping:
+                    self.garbled, self._skipping = self.garbled + 1, True
                 del data[:1]
                 continue
-            self._lost = False
-            taken = bytes(data[_HEADER.size:end])
+            self._skipping = False
+            payload = bytes(data[_HEADER.size:end])
             del data[:end + 1]
             return can.Message(
                 time(), frame_id, bool(flagged & _EXTENDED), bool(flagged & _REMOTE),
-                bool(flagged & _ERROR), None, dlc, taken)
+                bool(flagged & _ERROR), None, dlc, payload)
         return None

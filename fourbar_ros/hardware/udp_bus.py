@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A bus over UDP: one CAN frame in one datagram, for links that are reached by Wi-Fi.
+CAN frames over UDP, one per datagram, for links on Wi-Fi.
 
-python-can finds it by the name `fourbar_udp`. A datagram is, in network byte order, `FB`, the
-version 1, flags (1 extended, 2 remote, 4 error), the identifier in 4 bytes, the length code and
-the data; a remote frame has none. It is unicast: broadcast frames wait for the beacons of Wi-Fi,
-and are lost without being sent again.
+The name of the interface in python-can is `fourbar_udp`. A datagram has, in network byte order,
+`FB`, the version 1, flags (1 extended, 2 remote, 4 error), the identifier in 4 bytes, the length
+code and the data; a remote frame has no data. Datagrams are unicast: Wi-Fi delays broadcasts until
+a beacon, and does not repeat lost ones.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ _MAGIC, _VERSION = b'FB', 1
 _EXTENDED, _REMOTE, _ERROR = 1, 2, 4
 _LONGEST = _HEADER.size + 8
 
-# What the kernel keeps while nobody reads [bytes].
 _RECEIVE_BUFFER = 1 << 20
-# Python does not name it on every system; its data are a timespec.
+"""Size of the receive buffer of the kernel [bytes]."""
+# Not in the socket module of every Python; its data are a timespec.
 _SO_TIMESTAMPNS = getattr(socket, 'SO_TIMESTAMPNS', 35)
 _TIMESPEC = Struct('@ll')
 _ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size)
 
-# A peer that is not there yet, or any more.
-_NOBODY = {errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.EHOSTDOWN}
+# Errors that mean an absent peer.
+_UNREACHABLE = {errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.EHOSTDOWN}
 
-# How long a call that shall not wait may go on past datagrams that are none of ours [s].
-_PATIENCE_S = 0.001
+_MAX_DISCARD_S = 0.001
+"""Time for which a receive call without timeout discards foreign datagrams [s]."""
 
 Address = tuple[str, int]
 
@@ -48,16 +48,16 @@ class UdpBus(can.BusABC):
     """
     CAN frames in UDP datagrams, to and from known peers (IPv4).
 
-    :param channel: `HOST:PORT` to bind; port 0 for one that is free.
-    :param peers: who hears every frame and is heard: `HOST:PORT,HOST:PORT`, or a sequence of
-        `HOST:PORT`, which may be empty where `add_peer` will be called.
-    :param can_filters: as with every bus of python-can.
-    :param bitrate: of no consequence here.
-    :ivar address: host and port that it is bound to.
-    :ivar foreign: number of datagrams from others than peers.
+    :param channel: `HOST:PORT` to bind; port 0 selects a free one.
+    :param peers: addresses that send and receive all frames: `HOST:PORT,HOST:PORT`, or a sequence
+        of `HOST:PORT`, which may be empty if `add_peer` is called later.
+    :param can_filters: as for every bus of python-can.
+    :param bitrate: ignored.
+    :ivar address: bound host and port.
+    :ivar foreign: number of datagrams from other senders than peers.
     :ivar malformed: number of datagrams from peers that are no frames.
-    :ivar unreachable: number of frames to a peer that is not there.
-    :raises can.CanInitializationError: an address that is none, no peers, a port that is in use.
+    :ivar unreachable: number of frames to an absent peer.
+    :raises can.CanInitializationError: invalid address, no peers, or port in use.
     """
 
     def __init__(self, channel: str, peers: str | Sequence[str] | None = None,
@@ -81,7 +81,7 @@ class UdpBus(can.BusABC):
             try:
                 self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
             except OSError:
-                pass  # then the time of reading is that of arrival
+                pass  # without it, the time of reading is the time of arrival
             self._socket.bind(local)
         except OSError as error:
             self._socket.close()
@@ -90,17 +90,17 @@ class UdpBus(can.BusABC):
         self.address: Address = self._socket.getsockname()
         self.channel_info = f'fourbar_udp {self.address[0]}:{self.address[1]}'
         self._readers = [self._socket]
-        # One longer than a frame may be, to see what is too long.
+        # One byte longer than a frame, to detect datagrams that are too long.
         self._buffer = bytearray(_LONGEST + 1)
         self._into = [self._buffer]
         super().__init__(channel=channel, can_filters=can_filters)
 
     def add_peer(self, peer: str) -> None:
         """
-        Send to one more, and hear it.
+        Add a peer.
 
         :param peer: `HOST:PORT`.
-        :raises can.CanInitializationError: it is no address.
+        :raises can.CanInitializationError: invalid address.
         """
         self._peers[_resolved(peer, 1)] = None
 
@@ -108,8 +108,8 @@ class UdpBus(can.BusABC):
         """
         Send a frame to every peer.
 
-        :param timeout: not used: it does not wait.
-        :raises can.CanOperationError: the system takes no more, or the network is down.
+        :param timeout: not used; the call does not wait.
+        :raises can.CanOperationError: the send buffer is full, or the network is down.
         """
         if msg.is_fd or msg.dlc > 8:
             raise can.CanOperationError('fourbar_udp carries classic CAN frames only')
@@ -121,17 +121,17 @@ class UdpBus(can.BusABC):
             try:
                 self._socket.sendto(datagram, peer)
             except OSError as error:
-                if error.errno in _NOBODY:
+                if error.errno in _UNREACHABLE:
                     self.unreachable += 1
                 else:
-                    # The others shall hear it all the same.
+                    # Raised after the other peers have the frame.
                     failed = error
         if failed is not None:
             raise can.CanOperationError(
                 f'cannot send: {failed.strerror or failed}', failed.errno) from failed
 
     def fileno(self) -> int:
-        """Return the descriptor to wait at."""
+        """Return the file descriptor for `select`."""
         return self._socket.fileno()
 
     def shutdown(self) -> None:
@@ -163,9 +163,9 @@ class UdpBus(can.BusABC):
             message = self._message(length, ancillary, sender)
             if message is not None:
                 return message, False
-            # Whoever floods the port shall not hold up who only wants to have a look.
+            # A flood of foreign datagrams must not extend a call without timeout.
             if deadline is None and timeout is not None:
-                deadline = monotonic() + max(timeout, _PATIENCE_S)
+                deadline = monotonic() + max(timeout, _MAX_DISCARD_S)
             if deadline is not None and monotonic() >= deadline:
                 return None, False
 
@@ -194,16 +194,16 @@ class UdpBus(can.BusABC):
 
 
 def _resolved(address: str, lowest_port: int) -> Address:
-    """Return host (as a number) and port of `HOST:PORT`."""
+    """Return numeric host and port of `HOST:PORT`."""
     host, _, port = address.strip().rpartition(':')
     if not host or not port.isdecimal() or not lowest_port <= int(port) <= 65535:
         raise can.CanInitializationError(
             f'{address!r} is no address: HOST:PORT is needed, the port from {lowest_port} '
             'to 65535')
     try:
-        found = socket.getaddrinfo(host, int(port), socket.AF_INET, socket.SOCK_DGRAM)
+        resolved = socket.getaddrinfo(host, int(port), socket.AF_INET, socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
         raise can.CanInitializationError(
             f'{address!r}: no such host ({getattr(error, "strerror", None) or error})'
         ) from error
-    return str(found[0][4][0]), int(port)
+    return str(resolved[0][4][0]), int(port)

@@ -3,7 +3,7 @@
 
 """The clock of a link, found from exchanges over a bus that takes its time."""
 
-from fourbar_ros.hardware.link_clock import ENOUGH, LinkClock
+from fourbar_ros.hardware.link_clock import LinkClock, SETTLED_EXCHANGES
 import numpy as np
 import pytest
 
@@ -41,7 +41,7 @@ def test_times_of_the_link_are_found(drift: float, slowest_s: float, allowed_s: 
 
 def test_clock_is_settled_after_a_few_exchanges_and_not_before() -> None:
     clock, rng = LinkClock(), np.random.default_rng(0)
-    exchanges(clock, rng, ENOUGH - 1, 0.0, 1e-5)
+    exchanges(clock, rng, SETTLED_EXCHANGES - 1, 0.0, 1e-5)
     assert not clock.settled
     exchanges(clock, rng, 1, 0.0, 1e-5, begin_ns=START_NS + 10 * STEP_NS)
     assert clock.settled
