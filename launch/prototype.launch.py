@@ -100,11 +100,11 @@ def generate_launch_description():
             'table', default_value='',
             description='table preset (prototype) or path of a table file for the emulated links; '
                         'empty: as in params_file'),
-        OpaqueFunction(function=_start),
+        OpaqueFunction(function=start_nodes),
     ])
 
 
-def _start(context):
+def start_nodes(context):
     def argument(name):
         return LaunchConfiguration(name).perform(context)
 

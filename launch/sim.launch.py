@@ -65,11 +65,11 @@ def generate_launch_description():
         DeclareLaunchArgument(
             'setpoint_duration', default_value='',
             description='time in which a setpoint is reached [s], 10.0 unless given'),
-        OpaqueFunction(function=_start),
+        OpaqueFunction(function=start_nodes),
     ])
 
 
-def _start(context):
+def start_nodes(context):
     def argument(name):
         return LaunchConfiguration(name).perform(context)
 

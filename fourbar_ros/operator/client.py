@@ -39,6 +39,8 @@ RETRY_INTERVAL = 1.0
 """Retry interval of a service call [s]."""
 DISCOVERY_DELAY = 0.2
 """Delay of a call that must not be retried, in which the server discovers the client [s]."""
+POLL_INTERVAL = 0.05
+"""Longest time between two checks of a condition [s]."""
 IDEMPOTENT = frozenset({DAMP, EMERGENCY_STOP, ESTIMATE_RESET, HOLD, SIM_PAUSE, SIM_RESET})
 """
 Services that may be retried: a second call has no further effect.
@@ -119,6 +121,8 @@ class TestbedClient:
         """
         Run callbacks until a condition holds.
 
+        :param seconds: longest wait [s]; time in which a busy machine does not run this process
+            does not count.
         :param missing: message of the error at a timeout; None to return False instead.
         :returns: whether the condition holds.
         :raises RosError: timeout.
@@ -138,7 +142,9 @@ class TestbedClient:
                 if missing is None:
                     return False
                 raise RosError(f'{missing} within {seconds:g} s', limit=seconds)
-            self.runtime.spin_once(min(0.05, remaining))
+            begin, timeout = time.monotonic(), min(POLL_INTERVAL, remaining)
+            self.runtime.spin_once(timeout)
+            end += max(0.0, time.monotonic() - begin - timeout)
 
     def subscribe_statuses(self, *topics: str) -> None:
         """Keep the newest message of DiagnosticStatus topics in `statuses`."""

@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from threading import Thread
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -35,13 +36,67 @@ _nursery = module_from_spec(_spec)
 _spec.loader.exec_module(_nursery)
 
 DEADLINE_S = 20.0
-# Longest time without a command: more than this machine holds a process up.
+"""Longest wait for a condition [s of LoadClock]."""
 COMMAND_TIMEOUT_S = 1.0
-# A first answer that takes longer was lost on its way.
-ASK_AGAIN_S = 3.0
+"""Command timeout of the devices in tests [s]: longer than other processes delay one here."""
+RETRY_INTERVAL_S = 3.0
+"""Time after which the first response of a service counts as lost [s of LoadClock]."""
 DOMAINS = range(1, 102)
-# Where a process was killed: what it held in shared memory may be locked for ever.
 spoiled_domains = set()
+"""Domains in which a process was killed: locks in shared memory may stay closed for ever."""
+
+
+class LoadClock:
+    """
+    A clock that slows down with the load of the machine.
+
+    A thread sleeps and then computes for WORK_S of processor time. On a quiet machine that takes
+    just this time from the end of the sleep; beside other processes it takes longer, by the factor
+    by which every process here is slower. The clock runs slower by that factor.
+    """
+
+    SLEEP_S = 0.05
+    WORK_S = 0.001
+
+    def __init__(self):
+        self.slowdown = 1.0
+        self._seconds = 0.0
+        self._updated = time.monotonic()
+        self._thread = None
+
+    def now(self):
+        """Return the time [s]; the first call starts the measurement."""
+        if self._thread is None:
+            self._thread = Thread(target=self._measure, daemon=True)
+            self._thread.start()
+        return self._seconds + (time.monotonic() - self._updated) / self.slowdown
+
+    def wait(self, condition, seconds=DEADLINE_S, interval=0.02):
+        """Poll a condition until it holds; fail after a time of this clock."""
+        end = self.now() + seconds
+        while not condition():
+            assert self.now() < end, 'timeout'
+            time.sleep(interval)
+
+    def sleep(self, seconds):
+        """Sleep for a time of this clock."""
+        end = self.now() + seconds
+        while self.now() < end:
+            time.sleep(0.01)
+
+    def _measure(self):
+        while True:
+            due, work = time.monotonic() + self.SLEEP_S, time.thread_time() + self.WORK_S
+            time.sleep(self.SLEEP_S)
+            while time.thread_time() < work:
+                pass
+            slowdown = max(1.0, (time.monotonic() - due) / self.WORK_S)
+            self._seconds, self._updated = self.now(), time.monotonic()
+            # Smoothed over about a second; limited, so that a failing test still ends.
+            self.slowdown = min(10.0, 0.95 * self.slowdown + 0.05 * slowdown)
+
+
+CLOCK = LoadClock()
 
 DEEP = QoSProfile(depth=5000)
 COMMAND = QoSProfile(depth=10)
@@ -151,7 +206,8 @@ class Process:
             if number is not None:
                 self.popen.send_signal(signal.SIGCONT)
                 self.popen.send_signal(number)
-        return self.popen.wait(seconds)
+        CLOCK.wait(lambda: self.popen.poll() is not None, seconds, 0.01)
+        return self.popen.returncode
 
     def kill(self):
         """Kill it."""
@@ -328,11 +384,12 @@ class Probe:
         """
         Run callbacks until a condition holds, and return what it returned.
 
-        :param instead: tells what is so if it does not.
+        :param seconds: longest wait [s of LoadClock].
+        :param instead: returns the present state, for the message of a timeout.
         """
-        end = time.monotonic() + seconds
+        end = CLOCK.now() + seconds
         while not (result := condition()):
-            assert time.monotonic() < end, f'it did not happen in time {instead()}'
+            assert CLOCK.now() < end, f'timeout {instead()}'
             self._executor.spin_once(timeout_sec=0.02)
         return result
 
@@ -413,17 +470,17 @@ class Probe:
         """
         Call a service and return its response.
 
-        Every service keeps its client: a response to one that the server has not discovered yet
-        is lost, and a client is ready before that (ros2/rmw_fastrtps, issue 842). So until a
-        client has had its first answer, it asks again.
+        Each service keeps its client. A server drops its response to a client that it has not
+        discovered yet, and a client is ready before that (ros2/rmw_fastrtps, issue 842). So a
+        client repeats its request until the first response.
         """
         unknown = service not in self._clients
         client = self._clients.get(service) or self.node.create_client(kind, service)
         self.wait(client.service_is_ready)
 
         def ask():
-            future, end = client.call_async(request), time.monotonic() + ASK_AGAIN_S
-            self.wait(lambda: future.done() or (unknown and time.monotonic() > end))
+            future, end = client.call_async(request), CLOCK.now() + RETRY_INTERVAL_S
+            self.wait(lambda: future.done() or (unknown and CLOCK.now() > end))
             return future if future.done() else None
         future = self.wait(ask)
         self._clients[service] = client
@@ -470,6 +527,12 @@ class Probe:
             now = values_of(received[-1])
             return now if any(now[key] != before[key] for key in ('accepted', 'refused')) else None
         return self.wait(judged)
+
+
+@pytest.fixture(scope='session')
+def load_clock():
+    """Return the clock of the deadlines."""
+    return CLOCK
 
 
 @pytest.fixture(scope='session')

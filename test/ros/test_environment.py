@@ -64,9 +64,9 @@ def test_bad_domain_is_refused_by_every_command(tmp_path, name):
 
 
 @pytest.mark.parametrize('domain', ['-1', '233', '999', '1.5', '0x10', '²', ' '])
-def test_bad_domain_is_refused(monkeypatch, domain):
+def test_bad_domain_is_refused(monkeypatch, refuses, domain):
     monkeypatch.setenv('ROS_DOMAIN_ID', domain)
-    with pytest.raises(environment.RosError, match='ROS_DOMAIN_ID'):
+    with refuses(environment.RosError, name='ROS_DOMAIN_ID', value=domain):
         environment.check_environment()
 
 

@@ -3,12 +3,12 @@
 
 """Every node ends when it is asked to: quickly, silently, and with the wheels let go."""
 
+from functools import partial
 from itertools import product
 from pathlib import Path
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from sensor_msgs.msg import JointState
@@ -110,8 +110,15 @@ sys.exit(main())
 NAMES = ('plant', 'estimator', 'controller', 'record')
 
 
+def has_middleware(process):
+    """Return whether the middleware has made its threads in a process, or the process ended."""
+    threads = Path(f'/proc/{process.pid}/task').glob('*/comm')
+    return process.poll() is not None or b'dds.' in b''.join(
+        path.read_bytes() for path in threads)
+
+
 @pytest.fixture(scope='module')
-def watched(domain, shared_memory, tmp_path_factory):
+def watched(domain, shared_memory, tmp_path_factory, load_clock):
     """
     Run commands, all at once, until the middleware has made its threads, and stop them then.
 
@@ -131,13 +138,8 @@ def watched(domain, shared_memory, tmp_path_factory):
     try:
         for process in started.values():
             # The middleware makes its threads before the node takes signals.
-            deadline = time.monotonic() + 20.0
-            threads = Path(f'/proc/{process.pid}/task')
-            while b'dds.' not in b''.join(
-                    path.read_bytes() for path in threads.glob('*/comm')):
-                assert process.poll() is None
-                assert time.monotonic() < deadline
-                time.sleep(0.05)
+            load_clock.wait(partial(has_middleware, process))
+            assert process.poll() is None
             shared_memory.note(process.pid)
             process.send_signal(signal.SIGINT)
         for key, process in started.items():
