@@ -117,7 +117,7 @@ class Port:
                 arbitration_id=frame_id, is_extended_id=False, is_remote_frame=remote,
                 dlc=8 if remote else None, data=data))
         except self._driver_errors as error:
-            raise BusError(f'{self.name}: cannot send: {_cause(error)}', bus=self.name) from error
+            raise _bus_error(self.name, 'cannot send: ', error) from error
         self.sent += 1
 
     def receive(self, timeout_s: float) -> tuple[Frame, int] | None:
@@ -135,8 +135,7 @@ class Port:
             try:
                 message = self._open().recv(remaining_s)
             except self._driver_errors as error:
-                raise BusError(f'{self.name}: cannot receive: {_cause(error)}',
-                               bus=self.name) from error
+                raise _bus_error(self.name, 'cannot receive: ', error) from error
             if message is None:
                 return None
             if not (message.is_error_frame or message.is_extended_id or message.is_fd):
@@ -182,7 +181,7 @@ class Port:
         kind = message.arbitration_id
         if kind & _BUS_OFF:
             self._error_state = 'bus off'
-            raise BusError(f'{self.name}: {self.fault}')
+            raise BusError(f'{self.name}: {self.fault}', bus=self.name, state='bus off')
         if kind & _RESTARTED:
             self._error_state = None
         elif kind & _CONTROLLER and len(message.data) > 1:
@@ -198,7 +197,7 @@ def open_port(interface: str, channel: str, bitrate: int = 0, options: str = '')
     :param bitrate: [bit/s], 0 to leave it unchanged; on SocketCAN the system sets it.
     :param options: further options of the interface: `key=value key=value`.
     :raises BusError: python-can is not installed; no such interface or channel; bad options. Its
-        `values` have `bus`, and `option` for a bad option.
+        `values` have `bus`, `option` for a bad option, and `errno` of the system or None.
     """
     name = f'{interface} {channel}'
     settings = _settings(name, options)
@@ -225,12 +224,11 @@ def open_port(interface: str, channel: str, bitrate: int = 0, options: str = '')
         raise
     except (can.CanInterfaceNotImplementedError, ImportError, NameError) as error:
         # Some drivers of python-can import their library only here.
-        raise BusError(f'{name}: a required package is not installed: {_cause(error)} (serial '
-                       'lines and multicast: pip install fourbar_ros[hardware])', bus=name
-                       ) from error
+        raise _bus_error(name, 'a required package is not installed (serial lines and multicast: '
+                         'pip install fourbar_ros[hardware]): ', error) from error
     except Exception as error:
         # Drivers raise many kinds of errors.
-        raise BusError(f'{name}: {_cause(error)}', bus=name) from error
+        raise _bus_error(name, '', error) from error
     return Port(bus, interface, channel)
 
 
@@ -279,13 +277,14 @@ def _value(text: str) -> str | int | float | bool:
     return text
 
 
-def _cause(error: BaseException) -> str:
-    """Return the cause of an error in one line, with a remedy if one is known."""
+def _bus_error(name: str, action: str, error: BaseException) -> BusError:
+    """Return an error in one line, with its cause, and a remedy where one is known."""
     number = getattr(error, 'error_code', None) or getattr(error, 'errno', None)
     text = ' '.join((getattr(error, 'strerror', None) or str(error)).split())
     if 'buffer full' in text.lower():
         number = errno.ENOBUFS
-    return _CAUSES.get(number or 0, text or type(error).__name__)
+    text = _CAUSES.get(number or 0, text or type(error).__name__)
+    return BusError(f'{name}: {action}{text}', bus=name, errno=number)
 
 
 def _silence_logger() -> None:

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A bench of four wheels without a linkage, whose every torque is on record."""
+"""A device of four wheels without a linkage that records every torque."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ PERIOD_NS = 4_000_000
 
 class Bench(Device):
     """
-    A device that does what it is told.
+    A device that records its inputs and returns prepared outputs.
 
-    :ivar driven: torques of every step; speeds are followed in proportion, within the limits, and
-        without power there is none.
+    :ivar driven: torques of every step; a proportional controller follows speeds, within the
+        limits; without power the torque is 0.
     :ivar powered: which wheels had power in every step.
-    :ivar gate: set by whoever wants to know its state (and reason) at the last step.
+    :ivar arming: of the supervisor, to record its state and reason at the last step.
     :ivar arming_then: that state and reason.
-    :ivar links: the links that give a sample.
+    :ivar links: the links that have a sample.
     :ivar breaks: whether the next step fails.
-    :ivar complete: whether it hears its wheels.
-    :ivar told, gates: what it was told between steps, of drives and of the gate.
-    :ivar found, in_the_way: its findings, and what speaks against arming.
-    :ivar closed: whether it was.
+    :ivar complete: whether all wheels answer.
+    :ivar drives, states: drives and arming states that were sent between steps.
+    :ivar present_faults, blockers, held: prepared faults, arming blockers and stopped parts.
+    :ivar closed: whether the device was closed.
     """
 
     description = 'bench'
@@ -59,10 +59,10 @@ class Bench(Device):
         self.links: tuple[int, ...] = (0, 1, 2, 3)
         self.breaks = False
         self.complete = True
-        self.told: list[Drive] = []
-        self.gates: list[DeviceState] = []
-        self.found: list[DeviceFault] = []
-        self.in_the_way: list[str] = []
+        self.drives: list[Drive] = []
+        self.states: list[DeviceState] = []
+        self.present_faults: list[DeviceFault] = []
+        self.blockers: list[str] = []
         self.held: list[str] = []
         self.releases = 0
         self.closed = False
@@ -71,34 +71,34 @@ class Bench(Device):
         self.speeds = np.array([10.0, -20.0, 0.0, 5.0])
 
     def drive(self, drive: Drive) -> None:
-        """Take down what it is told between steps."""
+        """Record the drive."""
         if self.breaks:
             raise FourbarError('the bus is off')
-        self.told.append(drive)
+        self.drives.append(drive)
 
     def arming_changed(self, state: DeviceState) -> None:
-        """Take down what the gate does."""
-        self.gates.append(state)
+        """Record the state."""
+        self.states.append(state)
 
     def release(self) -> Sequence[str]:
-        """Take down that it was released, and tell what it was made to hold."""
+        """Count the call, and return the prepared parts."""
         self.releases += 1
         return self.held
 
     def faults(self) -> Sequence[DeviceFault]:
-        """Find what it was made to."""
-        return self.found
+        """Return the prepared faults."""
+        return self.present_faults
 
     def arming_blockers(self) -> Sequence[str]:
-        """Be in the way if it was made to."""
-        return self.in_the_way
+        """Return the prepared blockers."""
+        return self.blockers
 
     def close(self) -> None:
-        """Take down that it was closed."""
+        """Record the call."""
         self.closed = True
 
     def step(self, stamp_ns: int, drive: Drive) -> Samples:
-        """Take down the torques and let the wheels follow them."""
+        """Record the torques, and accelerate the wheels."""
         inertias, limits = self.mechanism.flywheel_inertias, self.mechanism.motor_torque_limits
         following = np.clip(30.0 * inertias * (drive.values - self.speeds), -limits, limits)
         torques = np.where(
@@ -116,44 +116,44 @@ class Bench(Device):
 
 
 class Operated:
-    """A testbed around the bench, with both clocks in one hand."""
+    """A supervised device, with control over both clocks."""
 
     def __init__(self, mechanism: Mechanism, settings: SupervisorSettings) -> None:
-        self.bench = Bench(mechanism)
-        self.testbed = DeviceSupervisor(self.bench, settings)
-        self.bench.arming = self.testbed.arming
+        self.device = Bench(mechanism)
+        self.supervisor = DeviceSupervisor(self.device, settings)
+        self.device.arming = self.supervisor.arming
         self.stamp_ns = 1_000_000_000
         self.monotonic_ns = 50_000_000_000
 
-    def tick(self, periods: float = 1.0, steady: float | None = None
+    def tick(self, periods: float = 1.0, monotonic: float | None = None
              ) -> tuple[Samples, Timing]:
-        """Let stamps advance by some periods, the steady clock by as many unless told."""
+        """Advance stamps by some periods, and the monotonic clock by as many unless given."""
         self.stamp_ns += round(periods * PERIOD_NS)
-        self.monotonic_ns += round((periods if steady is None else steady) * PERIOD_NS)
-        result = self.testbed.tick(self.stamp_ns, self.monotonic_ns)
-        self.testbed.published(self.monotonic_ns, 1000)
+        self.monotonic_ns += round((periods if monotonic is None else monotonic) * PERIOD_NS)
+        result = self.supervisor.tick(self.stamp_ns, self.monotonic_ns)
+        self.supervisor.published(self.monotonic_ns, 1000)
         return result
 
     def command(self, *efforts: float, ahead_ns: int = 0, names: list[str] | None = None) -> None:
         """Command the wheels a, b, ..., as many as there are efforts."""
         wheels = [f'flywheel_{letter}' for letter in 'abcd'[:len(efforts)]]
-        self.testbed.command(
+        self.supervisor.command(
             self.stamp_ns + ahead_ns, names or wheels, [], [], list(efforts), self.monotonic_ns)
 
     def arm(self, *arming_blockers: str) -> tuple[bool, str]:
-        """Ask to drive."""
-        return self.testbed.arm(self.monotonic_ns, arming_blockers)
+        """Request arming."""
+        return self.supervisor.arm(self.monotonic_ns, arming_blockers)
 
     @property
     def driven(self) -> list[float]:
         """The torques of the last step."""
-        torques: list[float] = self.bench.driven[-1].tolist()
+        torques: list[float] = self.device.driven[-1].tolist()
         return torques
 
     @property
     def powered(self) -> list[bool]:
         """Which wheels had power in the last step."""
-        return self.bench.powered[-1]
+        return self.device.powered[-1]
 
 
 @pytest.fixture(scope='session')
@@ -164,7 +164,7 @@ def paper() -> Mechanism:
 
 @pytest.fixture(scope='session')
 def operate(paper: Mechanism) -> Callable[..., Operated]:
-    """Return a function that makes a testbed, armed after its first tick unless told."""
+    """Return a function that makes a supervised device, by default armed after one tick."""
     def make(armed: bool = True, **settings: object) -> Operated:
         operated = Operated(paper, SupervisorSettings(**settings))  # type: ignore[arg-type]
         if armed:

@@ -14,12 +14,12 @@ ALL = Participants(1, 1, 1, 1, 1)
 
 def waiting() -> tuple[LockstepClock, LockstepGuard, int]:
     """Return a lock-step whose first tick just went out to all, its guard and the time."""
-    pace = LockstepClock(PERIOD)
-    guard = LockstepGuard(pace, TIMEOUT, SETTLE)
+    clock = LockstepClock(PERIOD)
+    guard = LockstepGuard(clock, TIMEOUT, SETTLE)
     guard.update(ALL, 0)
     guard.update(ALL, SETTLE)
-    assert pace.due(SETTLE) == FIRST
-    return pace, guard, SETTLE
+    assert clock.due(SETTLE) == FIRST
+    return clock, guard, SETTLE
 
 
 def test_tick_is_sent_again_after_the_timeout_at_intervals_that_grow() -> None:
@@ -43,19 +43,19 @@ def test_link_angles_go_out_again_only_if_the_estimator_said_nothing() -> None:
 
 
 def test_answered_tick_needs_no_help() -> None:
-    pace, guard, start = waiting()
-    assert pace.answered(FIRST)
+    clock, guard, start = waiting()
+    assert clock.answered(FIRST)
     assert guard.recovery(FIRST, start + 100 * TIMEOUT) is Recovery.NOTHING
 
 
 def test_every_tick_has_its_own_patience() -> None:
-    pace, guard, now = waiting()
+    clock, guard, now = waiting()
     for _ in range(3):
         assert guard.recovery(None, now + TIMEOUT) is Recovery.NOTHING
         now += TIMEOUT + 1
         assert guard.recovery(None, now) is Recovery.SEND_ALL
-        assert pace.answered(pace.now_ns(now))
-        assert pace.due(now) is not None
+        assert clock.answered(clock.now_ns(now))
+        assert clock.due(now) is not None
 
 
 def test_nothing_is_sent_to_nobody() -> None:

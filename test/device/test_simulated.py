@@ -256,16 +256,18 @@ def test_scheduled_faults_come_and_go_on_time(make: Make) -> None:
         assert missing is (10 <= n < 20), f'tick {n}'
         # A fault of the tick acts on the period that begins with it.
         assert bool(sample.wheels.efforts[0] == 0.0) is (n == 0 or n > 15), f'tick {n}'
-    with pytest.raises(FaultError, match='faults.yaml, entry 1.*past'):
+    with pytest.raises(FaultError) as caught:
         table.schedule_faults(
             [{'at': 0.1, 'target': 'link_a', 'fault': 'off'}], 'faults.yaml')
+    assert str(caught.value).startswith('faults.yaml, entry 1: at 0.1 s ')
 
 
 @pytest.mark.parametrize('target', ['joint_1', 'flywheel_e', 'link_x'])
 def test_what_is_not_there_cannot_break(target: str, make: Make) -> None:
     table = make()
-    with pytest.raises(FaultError, match=target):
+    with pytest.raises(FaultError) as caught:
         table.break_down(target, None)
+    assert target in str(caught.value)
 
 
 def test_reset_puts_the_linkage_and_leaves_time_and_faults(make: Make) -> None:
@@ -298,7 +300,7 @@ def test_wheels_are_named_as_in_the_topics(make: Make) -> None:
     assert make().injected_faults.targets[-4:] == FLYWHEEL_NAMES
 
 
-def test_what_is_broken_is_told_by_name(make: Make) -> None:
+def test_faults_are_reported_by_name(make: Make) -> None:
     table = make()
     assert table.diagnostics() == {}
     table.break_down('link_b', Fault('link_b', 'wrong', 0.25))
@@ -308,7 +310,7 @@ def test_what_is_broken_is_told_by_name(make: Make) -> None:
     assert table.diagnostics() == {'faults': 'flywheel_a dead'}
 
 
-def test_tilt_that_throws_the_linkage_off_the_table_is_told(ideal: Mechanism) -> None:
+def test_contact_with_the_edge_is_reported(ideal: Mechanism) -> None:
     plant = Plant(ideal, Table(LinkSensorSettings(), WheelEncoders(0), surface=Surface(
         tilt_x=0.05, size_x=0.7)), InitialState(), 5e-4, np.random.default_rng(0))
     table = SimulatedTable(plant, PERIOD_NS)

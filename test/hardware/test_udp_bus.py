@@ -187,39 +187,41 @@ def test_filters_are_those_of_python_can(pair):
 
 
 def test_only_classic_frames(pair):
-    with pytest.raises(can.CanOperationError, match='classic'):
+    with pytest.raises(can.CanOperationError):
         pair[0].send(can.Message(arbitration_id=1, is_fd=True, data=bytes(12)))
 
 
-def test_closed_bus_tells_so(make):
+def test_closed_bus_cannot_be_used(make):
     bus = make()
     bus.shutdown()
     bus.shutdown()
-    with pytest.raises(can.CanOperationError, match='cannot send'):
-        bus.add_peer('127.0.0.1:9')
+    bus.add_peer('127.0.0.1:9')
+    with pytest.raises(can.CanOperationError):
         bus.send(can.Message(arbitration_id=1))
-    with pytest.raises(can.CanOperationError, match='cannot receive'):
+    with pytest.raises(can.CanOperationError):
         bus.recv(0)
 
 
 def test_port_in_use(make):
     bus = make()
-    with pytest.raises(can.CanInitializationError, match='cannot bind .* in use'):
+    with pytest.raises(can.CanInitializationError) as caught:
         UdpBus(address(bus), ())
+    assert address(bus) in str(caught.value)
 
 
-@pytest.mark.parametrize('channel, options, told', [
-    ('127.0.0.1', {'peers': ()}, 'HOST:PORT'), (':1', {'peers': ()}, 'HOST:PORT'),
-    ('127.0.0.1:65536', {'peers': ()}, 'HOST:PORT'), ('127.0.0.1:x', {'peers': ()}, 'HOST:PORT'),
-    # Longer than a name may be: nobody is asked for it.
-    (f'{"x" * 64}:0', {'peers': ()}, 'no such host'),
-    ('192.0.2.1:0', {'peers': ()}, 'cannot bind'),
-    ('127.0.0.1:0', {}, 'needs peers'), ('127.0.0.1:0', {'peers': ''}, 'needs peers'),
-    ('127.0.0.1:0', {'peers': '127.0.0.1:0'}, 'from 1 to'),
-    ('127.0.0.1:0', {'peers': '127.0.0.1:5,'}, 'HOST:PORT'),
-    ('127.0.0.1:0', {'peers': (), 'perrs': 1}, 'knows no perrs'),
+@pytest.mark.parametrize('channel, options, refused', [
+    ('127.0.0.1', {'peers': ()}, "'127.0.0.1'"), (':1', {'peers': ()}, "':1'"),
+    ('127.0.0.1:65536', {'peers': ()}, "'127.0.0.1:65536'"),
+    ('127.0.0.1:x', {'peers': ()}, "'127.0.0.1:x'"),
+    # Too long for a host name, so that no name server is asked.
+    (f'{"x" * 64}:0', {'peers': ()}, f"'{'x' * 64}:0'"),
+    ('192.0.2.1:0', {'peers': ()}, '192.0.2.1:0'),
+    ('127.0.0.1:0', {}, 'peers'), ('127.0.0.1:0', {'peers': ''}, 'peers'),
+    ('127.0.0.1:0', {'peers': '127.0.0.1:0'}, "'127.0.0.1:0'"),
+    ('127.0.0.1:0', {'peers': '127.0.0.1:5,'}, "''"),
+    ('127.0.0.1:0', {'peers': (), 'perrs': 1}, 'perrs'),
 ])
-def test_bad_address_or_option_is_told_in_one_line(channel, options, told):
-    with pytest.raises(can.CanInitializationError, match=told) as caught:
+def test_bad_address_or_option_is_reported_in_one_line(channel, options, refused):
+    with pytest.raises(can.CanInitializationError) as caught:
         UdpBus(channel, **options)
-    assert '\n' not in str(caught.value)
+    assert refused in str(caught.value) and '\n' not in str(caught.value)

@@ -181,7 +181,7 @@ def test_clock_topic_rises_slowly_enough_and_stamps_follow_it(nodes, clock):
 
 
 def test_fast_clock_passes_faster_than_real_time_and_leaves_out_no_tick(nodes):
-    """How many times as fast is told by test_pacing; here a busy machine may lag, and catch up."""
+    """The ratio is tested by test_clock_modes; here a busy machine may lag, and catch up."""
     namespace, testbed, _ = nodes('plant', clock='fast', real_time_factor=2.0)
     testbed.wait(lambda: len(testbed.received['flywheel_states']) >= 10)
     begin = testbed.node.get_clock().now().nanoseconds

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The arming gate, every state against every event."""
+"""The arming arming, every state against every event."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,12 +16,12 @@ DISARMED, ARMED, STOPPED, FAULT = (
     DeviceState.DISARMED, DeviceState.ARMED, DeviceState.EMERGENCY_STOP, DeviceState.FAULT)
 NOW = 5
 EVENTS: dict[str, Callable[[Arming], Any]] = {
-    'arm': lambda gate: gate.arm(NOW, []),
-    'arm despite an obstacle': lambda gate: gate.arm(NOW, ['the door is open']),
-    'disarm': lambda gate: gate.disarm(NOW, 'new reason'),
-    'stop': lambda gate: gate.emergency_stop(NOW, 'new reason'),
-    'fail': lambda gate: gate.fail(NOW, 'new reason'),
-    'reset': lambda gate: gate.reset(NOW),
+    'arm': lambda arming: arming.arm(NOW, []),
+    'arm despite a blocker': lambda arming: arming.arm(NOW, ['the door is open']),
+    'disarm': lambda arming: arming.disarm(NOW, 'new reason'),
+    'stop': lambda arming: arming.emergency_stop(NOW, 'new reason'),
+    'fail': lambda arming: arming.fail(NOW, 'new reason'),
+    'reset': lambda arming: arming.reset(NOW),
 }
 WAYS = {
     DISARMED: [],
@@ -32,7 +32,7 @@ WAYS = {
 # What follows each event, by the state before it.
 AFTER = {
     'arm': {DISARMED: ARMED, ARMED: ARMED, STOPPED: STOPPED, FAULT: FAULT},
-    'arm despite an obstacle': {
+    'arm despite a blocker': {
         DISARMED: DISARMED, ARMED: ARMED, STOPPED: STOPPED, FAULT: FAULT},
     'disarm': {DISARMED: DISARMED, ARMED: DISARMED, STOPPED: STOPPED, FAULT: FAULT},
     'stop': {DISARMED: STOPPED, ARMED: STOPPED, STOPPED: STOPPED, FAULT: STOPPED},
@@ -41,32 +41,32 @@ AFTER = {
 }
 
 
-def gate_in(state: DeviceState) -> Arming:
-    """Bring a new gate into a state, through the events that lead there."""
-    gate = Arming()
+def arming_in(state: DeviceState) -> Arming:
+    """Bring a new arming into a state, through the events that lead there."""
+    arming = Arming()
     for event in WAYS[state]:
-        EVENTS[event](gate)
-    gate.reason, gate.since_ns = 'old reason', 1
-    assert gate.state is state
-    return gate
+        EVENTS[event](arming)
+    arming.reason, arming.since_ns = 'old reason', 1
+    assert arming.state is state
+    return arming
 
 
 @pytest.mark.parametrize('before', list(DeviceState), ids=lambda state: state.value)
 @pytest.mark.parametrize('event', list(EVENTS))
 def test_event_leads_where_the_table_says(event: str, before: DeviceState) -> None:
-    gate = gate_in(before)
-    EVENTS[event](gate)
-    assert gate.state is AFTER[event][before]
-    assert gate.armed is (gate.state is ARMED)
-    if gate.state is before:
+    arming = arming_in(before)
+    EVENTS[event](arming)
+    assert arming.state is AFTER[event][before]
+    assert arming.armed is (arming.state is ARMED)
+    if arming.state is before:
         # Nothing happened: the first reason is the one worth knowing.
-        assert (gate.reason, gate.since_ns) == ('old reason', 1)
+        assert (arming.reason, arming.since_ns) == ('old reason', 1)
     else:
-        assert gate.reason != 'old reason'
-        assert gate.since_ns == NOW
+        assert arming.reason != 'old reason'
+        assert arming.since_ns == NOW
 
 
-def test_new_gate_is_disarmed() -> None:
+def test_initial_state_is_disarmed() -> None:
     assert Arming().state is DISARMED
     assert not Arming().armed
 
@@ -79,7 +79,7 @@ def test_new_gate_is_disarmed() -> None:
 ])
 def test_refusal_says_why(
         state: DeviceState, arming_blockers: list[str], needles: list[str]) -> None:
-    armed, message = gate_in(state).arm(NOW, arming_blockers)
+    armed, message = arming_in(state).arm(NOW, arming_blockers)
     assert not armed
     for needle in needles:
         assert needle in message
@@ -87,12 +87,12 @@ def test_refusal_says_why(
 
 @pytest.mark.parametrize('state', [DISARMED, ARMED])
 def test_arming_tells_success(state: DeviceState) -> None:
-    assert gate_in(state).arm(NOW, [])[0]
+    assert arming_in(state).arm(NOW, [])[0]
 
 
 @pytest.mark.parametrize('state', list(DeviceState), ids=lambda state: state.value)
 def test_reset_always_succeeds_and_tells_what_it_released(state: DeviceState) -> None:
-    released, message = gate_in(state).reset(NOW)
+    released, message = arming_in(state).reset(NOW)
     assert released
     assert state.value in message
 
@@ -101,11 +101,11 @@ def test_reset_always_succeeds_and_tells_what_it_released(state: DeviceState) ->
 @given(events=st.lists(st.sampled_from(sorted(EVENTS)), max_size=30))
 def test_only_a_reset_and_then_arm_lead_from_a_latched_state_to_armed(events: list[str]) -> None:
     """Whatever happens, `armed` is entered from `disarmed` alone, and only when asked."""
-    gate = Arming()
+    arming = Arming()
     for event in events:
-        before = gate.state
-        EVENTS[event](gate)
-        if gate.armed and before is not ARMED:
+        before = arming.state
+        EVENTS[event](arming)
+        if arming.armed and before is not ARMED:
             assert (before, event) == (DISARMED, 'arm')
-        if before in (STOPPED, FAULT) and gate.state not in (STOPPED, FAULT):
-            assert (gate.state, event) == (DISARMED, 'reset')
+        if before in (STOPPED, FAULT) and arming.state not in (STOPPED, FAULT):
+            assert (arming.state, event) == (DISARMED, 'reset')
