@@ -1,6 +1,6 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Draw the figures of the documents but those of studies: `.venv/bin/python docs/figures.py`."""
+"""Draw all figures of the documents but those of studies: `.venv/bin/python docs/figures.py`."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def main() -> None:
     with rc_context({**RC, 'figure.facecolor': 'white'}):
         for name, draw in (
                 ('mechanics_linkage', linkage), ('mechanics_change_point', change_point),
-                ('mechanics_conditioning', conditioning), ('table_friction', friction),
+                ('table_friction', friction),
                 ('table_stiction', stiction), ('table_energy', energy),
                 ('table_sensors', sensors), ('estimation_suspicion', suspicion),
                 ('estimation_change_point', fold), ('calibration_wheels', calibrated_wheels),
@@ -135,40 +135,6 @@ def _passage(mismatch: float) -> tuple[Array, Array]:
     times = np.arange(0.0, 0.6, 1e-3)
     return times, move_with_cosines(make_state(angles, rates), times, NONE, NONE, NONE, 1e-3,
                                     mechanism.constants, NOTHING)
-
-
-def conditioning() -> Figure:
-    """Draw the condition number of A as in the paper's figure 6."""
-    figure, (ratio, offset) = pyplot.subplots(1, 2, figsize=(9.0, 3.4))
-    ratios = np.geomspace(0.25, 4.0, 81)
-    ratio.plot(ratios, [_condition(0.1 * value, NONE, 1.0) for value in ratios],
-               color=COLOURS['ink'])
-    ratio.set(xscale='log', yscale='log', xlabel=r'$l_a / l_b$', ylabel='cond A',
-              title='Lengths (the same at every θ)')
-    for axis in (ratio.xaxis, ratio.yaxis):
-        axis.set_major_formatter('{x:g}')
-        axis.set_minor_formatter('')
-    ratio.set_xticks([0.25, 0.5, 1.0, 2.0, 4.0])
-    ratio.set_yticks([1.0, 2.0, 5.0, 10.0])
-    offsets = np.linspace(-0.04, 0.04, 81)
-    for signs, dashes, text in ((np.ones(4), '-', 'same'), (
-            np.array([1.0, -1.0, -1.0, 1.0]), '--', 'inside')):
-        for theta, colour in ((0.3, LINK_COLOURS[0]), (np.pi / 2, LINK_COLOURS[1])):
-            offset.plot(1e3 * offsets, [_condition(0.1, value * signs, theta)
-                                        for value in offsets], dashes, color=colour,
-                        label=f'{text}, θ = {theta:.2f} rad')
-    offset.set(xlabel='offset y [mm]', ylabel='cond A', title='Offset of the mass centres')
-    offset.legend()
-    figure.tight_layout()
-    return figure
-
-
-def _condition(length_a: float, offsets: Array, theta: float) -> float:
-    lengths = np.array([length_a, 0.1, length_a, 0.1])
-    mechanism = Mechanism(lengths, [0.02] * 4, [2.2e-5] * 4,
-                          np.column_stack([0.5 * lengths, offsets]), [3.4e-7] * 4)
-    form = reduced_form(mechanism, np.tile([0.0, theta], 2), np.zeros(2))
-    return float(np.linalg.cond(form.mass_matrix))
 
 
 def friction() -> Figure:

@@ -23,7 +23,7 @@ from fourbar_ros.ros.parameters import markdown_text, prototype_text, yaml_text
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([ROOT / 'README.md', *(ROOT / 'docs').glob('*.md')])
+PAGES = sorted([ROOT / 'README.md', *(ROOT / 'docs').rglob('*.md')])
 
 
 def test_parameter_tables_are_those_of_the_nodes() -> None:
@@ -41,7 +41,7 @@ def test_parameters_file_of_the_prototype_is_that_of_its_scenario() -> None:
     assert (ROOT / 'config' / 'nodes_prototype.yaml').read_text() == prototype_text()
 
 
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page: Path) -> None:
     """Follow every relative link and picture."""
     targets = re.findall(r'\]\(([^)#\s]+)\)', page.read_text())
@@ -50,7 +50,7 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert missing == []
 
 
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_exist(page: Path) -> None:
     """Every `fourbar NAME` in a code block is a command."""
     blocks = re.findall(r'```\n(.*?)```', page.read_text(), re.DOTALL)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How fast and how exact the mechanics are, beside MuJoCo on the same machine in the same run.
+Speed and accuracy of the mechanics, compared with MuJoCo on the same machine in the same run.
 
-And how fast plant and closed loop are. docs/benchmarks.md says what is timed and how to read it.
-All rivals take turns in short stretches, and of each the quickest counts: what else runs on the
-machine only ever adds to a time.
+Also the speed of plant, filter, controller, closed loop and conditioning grid; see
+docs/benchmarks.md. All operations take turns in short stretches, and the least time of each
+counts, because other load on the machine only adds to a time.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ from fourbar_ros.mechanism.state import (
     WHEEL_SPEEDS,
 )
 from fourbar_ros.plant import InitialState, Plant
+from fourbar_ros.studies.conditioning_linkages import ratio_grid
 from fourbar_ros.studies.independent import installed
 from fourbar_ros.studies.independent.mujoco_model import MujocoLinkage, State, stiff
 import numpy as np
@@ -58,39 +59,40 @@ STEP = 1e-3
 LINKAGE = 'asymmetric'
 SAMPLING = 'zero-order hold, sampled at the start of each step'
 
-# Steps of one stretch: milliseconds, so that some of many stretches find the machine quiet.
+# Calls or steps in one stretch. A stretch takes milliseconds, so that some of many stretches run
+# without interruption.
 EVALUATIONS = 5000
 STEPS = 1000
 MUJOCO_STEPS = 400
 BATCH_STATES, BATCH_STEPS = 512, 40
+PLANT_STEPS = 400
+FILTER_STEPS = 200
+LOOP_TICKS = 50
 
-# The reference of the errors: steps so short that their error is 1.6e5 times less.
+# Substeps of the reference motion; its error is smaller by 20^4 = 1.6e5.
 REFERENCE_STEPS = 20
 
-# A paper rhombus that goes through theta = 0, from -0.04 to 0.04 rad in NEAR_STEPS.
+# Near alignment: a rhombus of the paper passes theta = 0, from -0.04 to 0.04 rad in NEAR_STEPS.
 NEAR_STEPS = 500
 NEAR_START, NEAR_RATE, NEAR_TURN = -0.04, 0.16, 0.5
 NEAR_TORQUE = 1e-6
 
-# The plant with every effect on, links and wheels moving, and the closed loop around it.
+# The plant with every effect on, links and wheels in motion.
 SCENARIO = 'prototype'
-PLANT_STEPS = 400
-PLANT_AWAY = InitialState(0.0, 1.0, 'open', 0.3, -0.2)
-PLANT_NEAR = InitialState(0.0, 0.04, 'open', 0.3, -0.1)
+PLANT_STATES = {'plant_step_ns': InitialState(0.0, 1.0, 'open', 0.3, -0.2),
+                'plant_step_near_alignment_ns': InitialState(0.0, 0.04, 'open', 0.3, -0.1)}
 PLANT_TORQUE = 5e-3
-FILTER_STEPS = 200
-LOOP_TICKS = 50
 
-# The controller, with motors so weak [N m] that the shortest move takes all they have: so much of
-# it is timed [s], from the setpoint on.
+# The controller with weak motors [N m], so that the shortest move needs their full torque; time
+# after the setpoint that is timed [s].
 WEAK_MOTORS = 3e-3
 CONTROL_SECONDS = 2.0
 
-# The right-hand side runs on its own results, by so little that the motion stays: nothing of it
-# can be left out or done ahead.
+# The right-hand side takes its own result as input, scaled by this factor: no call can be omitted
+# or overlap with the next, and the motion does not change.
 FEEDBACK = 1e-12
 
-# In rounds. Its time varies most, by a fifth on a quiet machine.
+# Rounds between two fresh processes, whose times vary by a fifth on a quiet machine.
 FRESH_PROCESS_EVERY = 6
 FIRST_STEP = """
 import sys, time
@@ -107,31 +109,55 @@ move_held(state, numpy.zeros(4), 0.001, 1, paper.constants, NOTHING)
 print(time.perf_counter() - begin)
 """
 
-# What is printed: key, unit, what it is.
-QUANTITIES = (
-    ('rhs_ns', 'ns', 'one right-hand side'),
-    ('rk4_step_ns', 'ns', 'one Runge-Kutta step'),
-    ('rk4_step_near_alignment_ns', 'ns', 'one Runge-Kutta step, near alignment'),
-    ('batch_steps_per_s', '1/s', 'steps of many linkages on all cores'),
-    ('plant_step_ns', 'ns', 'one step of the plant, every effect on'),
-    ('plant_step_near_alignment_ns', 'ns', 'one step of the plant, near alignment'),
-    ('estimator_step_ns', 'ns', 'one step of the filter, prediction and four gated angles'),
-    ('control_step_p50_us', 'us', 'one tick of the controller, median'),
-    ('control_step_p99_us', 'us', 'one tick of the controller, 99th percentile'),
-    ('closed_loop_times_real_time', '', 'closed loop without ROS, times real time'),
-    ('mujoco_euler_step_ns', 'ns', 'one step of MuJoCo, Euler'),
-    ('mujoco_rk4_step_ns', 'ns', 'one step of MuJoCo, RK4'),
-    ('mujoco_euler_lean_step_ns', 'ns', 'one step of MuJoCo, Euler, needless stages off'),
-    ('mujoco_rk4_lean_step_ns', 'ns', 'one step of MuJoCo, RK4, needless stages off'),
-    ('ratio_vs_mujoco_euler', '', 'MuJoCo / ours, Euler'),
-    ('ratio_vs_mujoco_rk4', '', 'MuJoCo / ours, RK4'),
-    ('ratio_vs_mujoco_euler_lean', '', 'MuJoCo / ours, Euler, needless stages off'),
-    ('ratio_vs_mujoco_rk4_lean', '', 'MuJoCo / ours, RK4, needless stages off'),
-    ('error_rad', 'rad', 'largest error of a link angle in 10 s'),
-    ('mujoco_euler_error_rad', 'rad', 'the same of MuJoCo, Euler'),
-    ('mujoco_rk4_error_rad', 'rad', 'the same of MuJoCo, RK4'),
-    ('import_to_first_step_s', 's', 'import to first step, code cached'),
-)
+
+@dataclass(frozen=True)
+class Quantity:
+    """
+    A measured quantity.
+
+    :param unit: '' for a ratio.
+    :param text: what it is; '' for a quantity that is checked and not printed.
+    :param most, least: limits, None where there is none.
+    """
+
+    unit: str
+    text: str = ''
+    most: float | None = None
+    least: float | None = None
+
+
+QUANTITIES = {
+    'rhs_ns': Quantity('ns', 'one right-hand side'),
+    'rk4_step_ns': Quantity('ns', 'one Runge-Kutta step', 700.0),
+    'rk4_step_near_alignment_ns': Quantity(
+        'ns', 'one Runge-Kutta step, near alignment', 4000.0),
+    'batch_steps_per_s': Quantity('1/s', 'steps of many linkages on all cores', least=4e6),
+    'plant_step_ns': Quantity('ns', 'one step of the plant, every effect on', 3000.0),
+    'plant_step_near_alignment_ns': Quantity(
+        'ns', 'one step of the plant, near alignment', 6000.0),
+    'estimator_step_ns': Quantity(
+        'ns', 'one step of the filter, prediction and four gated angles', 60000.0),
+    'control_step_p50_us': Quantity('us', 'one tick of the controller, median', 40.0),
+    'control_step_p99_us': Quantity('us', 'one tick of the controller, 99th percentile', 200.0),
+    'closed_loop_times_real_time': Quantity(
+        '', 'closed loop without ROS, times real time', least=15.0),
+    'conditioning_grid_s': Quantity('s', 'conditioning of 200 x 200 configurations', 1.0),
+    'mujoco_euler_step_ns': Quantity('ns', 'one step of MuJoCo, Euler'),
+    'mujoco_rk4_step_ns': Quantity('ns', 'one step of MuJoCo, RK4'),
+    'mujoco_euler_lean_step_ns': Quantity('ns', 'one step of MuJoCo, Euler, unused stages off'),
+    'mujoco_rk4_lean_step_ns': Quantity('ns', 'one step of MuJoCo, RK4, unused stages off'),
+    'ratio_vs_mujoco_euler': Quantity('', 'MuJoCo / ours, Euler', least=8.0),
+    'ratio_vs_mujoco_rk4': Quantity('', 'MuJoCo / ours, RK4', least=30.0),
+    'ratio_vs_mujoco_euler_lean': Quantity('', 'MuJoCo / ours, Euler, unused stages off'),
+    'ratio_vs_mujoco_rk4_lean': Quantity('', 'MuJoCo / ours, RK4, unused stages off'),
+    'error_rad': Quantity('rad', 'largest error of a link angle in 10 s'),
+    'mujoco_euler_error_rad': Quantity('rad', 'the same of MuJoCo, Euler'),
+    'mujoco_rk4_error_rad': Quantity('rad', 'the same of MuJoCo, RK4'),
+    'import_to_first_step_s': Quantity('s', 'import to first step, code cached', 1.0),
+    # These confirm that the stretches are what their names say.
+    'smallest_sine': Quantity('', least=0.5),
+    'near_alignment_largest_sine': Quantity('', most=0.1),
+    'control_bounds_active': Quantity('', least=0.5)}
 
 
 class BenchmarkError(FourbarError):
@@ -141,11 +167,11 @@ class BenchmarkError(FourbarError):
 @dataclass(frozen=True, eq=False)
 class Stretch:
     """
-    A linkage on its way.
+    A motion under constant torques.
 
-    :param mechanism: which one.
-    :param start: (STATE_SIZE,).
-    :param torques: (4,) held all along [N m].
+    :param mechanism: the linkage.
+    :param start: initial state (STATE_SIZE,).
+    :param torques: (4,) [N m].
     """
 
     mechanism: Mechanism
@@ -154,13 +180,13 @@ class Stretch:
 
 
 @dataclass(frozen=True)
-class Rival:
+class Operation:
     """
-    Something to time.
+    An operation to time.
 
-    :param begin: goes back to the start, not timed.
-    :param run: what is timed.
-    :param count: how many of what is counted are in one run.
+    :param begin: restores the start; not timed.
+    :param run: the timed function.
+    :param count: number of calls or steps in one run.
     """
 
     begin: Callable[[], None]
@@ -169,12 +195,12 @@ class Rival:
 
 
 @dataclass(frozen=True, eq=False)
-class Takes:
+class ControlTimes:
     """
-    What came of each turn of the controller, filled as it goes.
+    Times of the controller, one entry for each run.
 
     :param times: (n,) of every tick [ns].
-    :param active: share of the ticks at which the bounds of the motors were.
+    :param active: share of the ticks at which a motor limit was active.
     """
 
     times: list[Array] = field(default_factory=list)
@@ -185,18 +211,20 @@ def measure(repeats: int, progress: Progress) -> dict[str, Any]:
     """
     Run the benchmark.
 
-    :param repeats: stretches of each rival.
-    :param progress: wraps an iterable that takes time, given also its length.
-    :returns: what goes into JSON, flat: names carry their units; `skipped` lists what is missing.
-    :raises BenchmarkError: a process of its own does not start, or repeats is not positive.
+    :param repeats: stretches of each operation.
+    :param progress: wraps an iterable of known length.
+    :returns: the content of the JSON, flat: names carry their units; `skipped` lists what is
+        missing.
+    :raises BenchmarkError: a process does not start, or repeats is not positive.
     :raises CaseError: the reference motion is missing.
     """
     if repeats < 1:
-        raise BenchmarkError(f'repeats must be at least 1, got {repeats}')
+        raise BenchmarkError(f'repeats must be at least 1, got {repeats}', name='repeats',
+                             value=repeats, limit=1)
     case = load_case(share_directory() / 'config' / 'reference' / f'{LINKAGE}.json')
     with_mujoco = installed('mujoco')
     results = _circumstances(repeats, with_mujoco)
-    # Two stages of their own, then the rounds, of which the first warms up.
+    # Two stages for the errors, then the rounds, the first of which warms up.
     count = 2 + repeats + 1
     stages = iter(progress(range(count), count))
     next(stages)
@@ -208,28 +236,31 @@ def measure(repeats: int, progress: Progress) -> dict[str, Any]:
         results |= _mujoco_errors(case, exact)
     middle = exact.shape[0] // 2
     away = Stretch(case.mechanism, exact[middle], _torques_at(case, float(case.times[middle])))
-    near = Stretch(load_mechanism('paper'), _near_alignment(), np.full(4, NEAR_TORQUE))
+    near = Stretch(load_mechanism('paper'), make_state(
+        np.tile([0.0, NEAR_START], 2), np.tile([NEAR_TURN, NEAR_TURN + NEAR_RATE], 2)),
+        np.full(4, NEAR_TORQUE))
     results['smallest_sine'] = float(_sines(away, STEPS).min())
     results['near_alignment_largest_sine'] = float(_sines(near, NEAR_STEPS).max())
-    takes = Takes()
-    rivals = {'rhs_ns': _right_hand_sides(away), 'rk4_step_ns': _steps(away, STEPS),
-              'rk4_step_near_alignment_ns': _steps(near, NEAR_STEPS), 'batch': _batch(away),
-              'plant_step_ns': _plant_steps(PLANT_AWAY),
-              'plant_step_near_alignment_ns': _plant_steps(PLANT_NEAR),
-              'estimator_step_ns': _filter_steps(), 'control': _control_ticks(takes),
-              'loop': _loop_ticks()}
-    if with_mujoco:
-        rivals |= _mujoco_rivals(away)
-    results |= _race(rivals, stages)
-    results['batch_steps_per_s'] = 1e9 / results.pop('batch')
-    del results['control']
+    control = ControlTimes()
+    least = _time_in_turns({
+        'rhs_ns': _right_hand_sides(away), 'rk4_step_ns': _steps(away, STEPS),
+        'rk4_step_near_alignment_ns': _steps(near, NEAR_STEPS), 'batch': _batch(away),
+        **{name: _plant_steps(initial) for name, initial in PLANT_STATES.items()},
+        'estimator_step_ns': _filter_steps(), 'control': _control_ticks(control),
+        'loop': _loop_ticks(),
+        'grid': Operation(lambda: None, lambda: _evaluate(ratio_grid), 1),
+        **(_mujoco_steps(away) if with_mujoco else {})}, stages)
+    results['batch_steps_per_s'] = 1e9 / least.pop('batch')
+    results['closed_loop_times_real_time'] = (
+        load_scenario(SCENARIO).plant.period_ns / least.pop('loop'))
+    results['conditioning_grid_s'] = 1e-9 * least.pop('grid')
+    del least['control']
+    results |= least
     for percent in (50, 99):
         # The first round warms up.
         results[f'control_step_p{percent}_us'] = min(
-            float(np.percentile(times, percent)) * 1e-3 for times in takes.times[1:])
-    results['control_bounds_active'] = min(takes.active)
-    results['closed_loop_times_real_time'] = (
-        load_scenario(SCENARIO).plant.period_ns / results.pop('loop'))
+            float(np.percentile(times, percent)) * 1e-3 for times in control.times[1:])
+    results['control_bounds_active'] = min(control.active)
     if with_mujoco:
         for name in ('euler', 'rk4', 'euler_lean', 'rk4_lean'):
             results[f'ratio_vs_mujoco_{name}'] = (
@@ -239,39 +270,21 @@ def measure(repeats: int, progress: Progress) -> dict[str, Any]:
 
 
 def checks_of(results: Mapping[str, Any]) -> list[Check]:
-    """Return what the results of :func:`measure` are held to; what was skipped is not."""
-    limits = [
-        at_most('rk4_step_ns', _number(results, 'rk4_step_ns'), 'ns', 700.0),
-        at_most('rk4_step_near_alignment_ns', _number(results, 'rk4_step_near_alignment_ns'),
-                'ns', 4000.0),
-        at_least('batch_steps_per_s', _number(results, 'batch_steps_per_s'), '1/s', 4e6),
-        at_most('plant_step_ns', _number(results, 'plant_step_ns'), 'ns', 3000.0),
-        at_most('plant_step_near_alignment_ns',
-                _number(results, 'plant_step_near_alignment_ns'), 'ns', 6000.0),
-        at_most('estimator_step_ns', _number(results, 'estimator_step_ns'), 'ns', 60000.0),
-        at_most('control_step_p50_us', _number(results, 'control_step_p50_us'), 'us', 40.0),
-        at_most('control_step_p99_us', _number(results, 'control_step_p99_us'), 'us', 200.0),
-        at_least('closed_loop_times_real_time',
-                 _number(results, 'closed_loop_times_real_time'), '', 15.0),
-        at_most('import_to_first_step_s', _number(results, 'import_to_first_step_s'), 's', 1.0),
-        # That the stretches are what they are called.
-        at_least('smallest_sine', _number(results, 'smallest_sine'), '', 0.5),
-        at_most('near_alignment_largest_sine', _number(results, 'near_alignment_largest_sine'),
-                '', 0.1),
-        at_least('control_bounds_active', _number(results, 'control_bounds_active'), '', 0.5)]
-    if 'mujoco_euler_step_ns' in results:
-        limits += [at_least('ratio_vs_mujoco_euler', _number(results, 'ratio_vs_mujoco_euler'),
-                            '', 8.0),
-                   at_least('ratio_vs_mujoco_rk4', _number(results, 'ratio_vs_mujoco_rk4'),
-                            '', 30.0)]
-    return limits
+    """Return the checks of the results of :func:`measure`; skipped quantities have none."""
+    checks = []
+    for name, quantity in QUANTITIES.items():
+        if name in results and quantity.most is not None:
+            checks.append(at_most(name, _number(results, name), quantity.unit, quantity.most))
+        if name in results and quantity.least is not None:
+            checks.append(at_least(name, _number(results, name), quantity.unit, quantity.least))
+    return checks
 
 
 def table(results: Mapping[str, Any]) -> str:
-    """Return the results of :func:`measure` for people, in lines."""
-    found = [(_text(_number(results, name)), unit, text) for name, unit, text in QUANTITIES
-             if name in results]
-    width = max(len(text) for _, _, text in found)
+    """Return the results of :func:`measure` as text."""
+    rows = [(quantity, _number(results, name)) for name, quantity in QUANTITIES.items()
+            if quantity.text and name in results]
+    width = max(len(quantity.text) for quantity, _ in rows)
     return '\n'.join([
         f'{results["cores"]} cores, {results["cpu"]}, load average '
         f'{results["load_average_1min"]:.2f}',
@@ -279,10 +292,11 @@ def table(results: Mapping[str, Any]) -> str:
         f'linkage {results["linkage"]}, steps of {results["step_s"] * 1e3:g} ms, torques: '
         f'{results["torque_sampling"]}',
         f'times are the {results["statistic"]}',
-        *(f'{text:<{width}}  {value:>9} {unit}'.rstrip() for value, unit, text in found)])
+        *(f'{quantity.text:<{width}}  {_digits(value):>9} {quantity.unit}'.rstrip()
+          for quantity, value in rows)])
 
 
-def _text(value: float) -> str:
+def _digits(value: float) -> str:
     return f'{value:.0f}' if value >= 1000.0 else f'{value:.3g}'
 
 
@@ -303,7 +317,7 @@ def _circumstances(repeats: int, with_mujoco: bool) -> dict[str, Any]:
         'step_s': STEP,
         'torque_sampling': SAMPLING,
         'load_average_1min': os.getloadavg()[0],
-        'statistic': f'least of {repeats} stretches of each rival in turn',
+        'statistic': f'least of {repeats} stretches of each operation in turn',
         'error_reference': f'ours with {REFERENCE_STEPS} steps in each, the same torques',
         'skipped': [] if with_mujoco else [
             'no comparison with MuJoCo: mujoco is missing (pip install mujoco)']}
@@ -325,10 +339,10 @@ def _torques_at(case: Case, time: float) -> Array:
 
 def _held_motion(case: Case, steps: NDArray[np.int64], substeps: int) -> Array:
     """
-    Follow the motion of a case under torques that are held over each step.
+    Simulate a case under torques that are held over each step.
 
-    :param steps: (n,) how many steps each of the case's times is after the first.
-    :param substeps: into how many each step is divided.
+    :param steps: (n,) number of steps from the first of the case's times to each.
+    :param substeps: substeps of each step.
     :returns: (n, STATE_SIZE).
     """
     state = make_state(case.link_angles, case.link_rates, case.flywheel_speeds_absolute)
@@ -346,7 +360,7 @@ def _largest_error(angles: Array, exact: Array) -> float:
 
 
 def _mujoco_errors(case: Case, exact: Array) -> dict[str, float]:
-    """Follow the motion of a case with MuJoCo, the torques held likewise."""
+    """Simulate a case with MuJoCo under the same held torques."""
     errors = {}
     for name in ('Euler', 'RK4'):
         linkage = MujocoLinkage(case.mechanism, stiff(name, STEP))
@@ -361,29 +375,28 @@ def _mujoco_state(state: Array) -> State:
                  state[CENTRE_POSITION], state[CENTRE_VELOCITY])
 
 
-def _near_alignment() -> Array:
-    """Return a rhombus that moves towards theta = 0 while it turns, (STATE_SIZE,)."""
-    return make_state(np.tile([0.0, NEAR_START], 2),
-                      np.tile([NEAR_TURN, NEAR_TURN + NEAR_RATE], 2))
-
-
 def _sines(stretch: Stretch, steps: int) -> Array:
     """Return |sin(phi_d - phi_c)| at every step of a stretch."""
     state = stretch.start.copy()
-    differences = [state[3] - state[2]]
+    angles = [state[LINK_ANGLES].copy()]
     for _ in range(steps):
         move_held(state, stretch.torques, STEP, 1, stretch.mechanism.constants, NOTHING)
-        differences.append(state[3] - state[2])
-    sines: Array = np.abs(np.sin(differences))
+        angles.append(state[LINK_ANGLES].copy())
+    _, _, phi_c, phi_d = np.array(angles).T
+    sines: Array = np.abs(np.sin(phi_d - phi_c))
     return sines
 
 
-def _right_hand_sides(stretch: Stretch) -> Rival:
+def _evaluate(function: Callable[[], Any]) -> None:
+    function()
+
+
+def _right_hand_sides(stretch: Stretch) -> Operation:
     constants, torques = stretch.mechanism.constants, stretch.torques
     state, out = stretch.start.copy(), np.empty(STATE_SIZE)
     rate_a = LINK_RATES.start
 
-    # Not kept: the fingerprint of the cache does not cover this file.
+    # Not cached: the fingerprint of the cache does not cover this file.
     @compiler.kernel(cache=False)
     def evaluate_often(state: Array, torques: Array, constants: Any, around: Any, out: Array,
                        count: int) -> None:
@@ -391,38 +404,35 @@ def _right_hand_sides(stretch: Stretch) -> Rival:
             evaluate(state, torques, constants, around, out)
             state[rate_a] += FEEDBACK * out[rate_a]
 
-    def begin() -> None:
-        state[:] = stretch.start
-
-    return Rival(begin, lambda: evaluate_often(state, torques, constants, NOTHING, out,
-                                               EVALUATIONS), EVALUATIONS)
+    return Operation(lambda: np.copyto(state, stretch.start),
+                     lambda: evaluate_often(state, torques, constants, NOTHING, out, EVALUATIONS),
+                     EVALUATIONS)
 
 
-def _steps(stretch: Stretch, count: int) -> Rival:
+def _steps(stretch: Stretch, count: int) -> Operation:
     constants, state = stretch.mechanism.constants, stretch.start.copy()
-
-    def begin() -> None:
-        state[:] = stretch.start
-
-    return Rival(begin, lambda: move_held(state, stretch.torques, STEP, count, constants, NOTHING),
-                 count)
+    return Operation(lambda: np.copyto(state, stretch.start),
+                     lambda: move_held(state, stretch.torques, STEP, count, constants, NOTHING),
+                     count)
 
 
-def _batch(stretch: Stretch) -> Rival:
+def _batch(stretch: Stretch) -> Operation:
     constants = stretch.mechanism.constants
     states = np.tile(stretch.start, (BATCH_STATES, 1))
     torques = np.tile(stretch.torques, (BATCH_STATES, 1))
 
-    def begin() -> None:
-        # The other cores have slept while the single-threaded rivals had their turns.
+    def run() -> None:
         move_batch(states, torques, STEP, BATCH_STEPS, constants, NOTHING)
+
+    def begin() -> None:
+        # An untimed run wakes the cores that the single-threaded operations left idle.
+        run()
         states[:] = stretch.start
 
-    return Rival(begin, lambda: move_batch(states, torques, STEP, BATCH_STEPS, constants, NOTHING),
-                 BATCH_STATES * BATCH_STEPS)
+    return Operation(begin, run, BATCH_STATES * BATCH_STEPS)
 
 
-def _plant_steps(initial: InitialState) -> Rival:
+def _plant_steps(initial: InitialState) -> Operation:
     scenario = load_scenario(SCENARIO)
     plant = Plant(scenario.mechanism, scenario.table, initial, scenario.plant.step,
                   np.random.default_rng(0))
@@ -432,11 +442,11 @@ def _plant_steps(initial: InitialState) -> Rival:
         plant.reset(initial)
         plant.disturb(scenario.plant.step)
 
-    return Rival(begin, lambda: plant.advance(PLANT_STEPS, torques), PLANT_STEPS)
+    return Operation(begin, lambda: plant.advance(PLANT_STEPS, torques), PLANT_STEPS)
 
 
-def _filter_steps() -> Rival:
-    """Predict over a period and correct with four angles, each gated, again and again."""
+def _filter_steps() -> Operation:
+    """Predict over a period and correct with four gated angles, repeatedly."""
     scenario = load_scenario(SCENARIO)
     settings, period_s = scenario.estimator, scenario.plant.period_ns * 1e-9
     angles = assemble(scenario.mechanism, scenario.initial.link_a, scenario.initial.link_b)
@@ -449,11 +459,11 @@ def _filter_steps() -> Rival:
             linkage.move(period_s, torques)
             linkage.correct((0, 1, 2, 3), linkage.angles, variances, settings.gate)
 
-    return Rival(lambda: None, run, FILTER_STEPS)
+    return Operation(lambda: None, run, FILTER_STEPS)
 
 
-def _control_ticks(takes: Takes) -> Rival:
-    """Give the controller what it was given in a run of the closed loop, tick by tick."""
+def _control_ticks(control: ControlTimes) -> Operation:
+    """Run the controller with the recorded inputs of a closed loop, tick by tick."""
     scenario = load_scenario(SCENARIO)
     mechanism = replace(scenario.mechanism, motor_torque_limits=np.full(4, WEAK_MOTORS))
     setpoint = scenario.setpoints[0]
@@ -461,39 +471,39 @@ def _control_ticks(takes: Takes) -> Rival:
         scenario, mechanism=mechanism, model=mechanism, duration=setpoint.at + CONTROL_SECONDS,
         controller=replace(scenario.controller, allocation='bounded', command='velocity',
                            setpoint_timing='shortest'))
-    given = [(step.samples.stamp_ns, step.estimate.link_angles, step.estimate.link_rates,
-              step.estimate.disturbance, step.samples.wheels.speeds, step.samples.wheels.efforts)
-             for step in run_scenario(scenario) if step.estimate is not None]
-    # Ticks after the setpoint, of which the estimator answers each.
+    inputs = [(step.samples.stamp_ns, step.estimate.link_angles, step.estimate.link_rates,
+               step.estimate.disturbance, step.samples.wheels.speeds, step.samples.wheels.efforts)
+              for step in run_scenario(scenario) if step.estimate is not None]
+    # Ticks after the setpoint; the estimator has an estimate at each.
     count = scenario.ticks - 1 - scenario.tick_at(setpoint.at)
     controllers: list[Controller] = []
 
     def begin() -> None:
         controller = Controller(mechanism, scenario.controller)
         controller.device_armed(True)
-        for inputs in given[:-count]:
-            controller.tick(*inputs)
+        for row in inputs[:-count]:
+            controller.tick(*row)
         controller.setpoint(setpoint.names, setpoint.positions)
         controllers[:] = [controller]
 
     def run() -> None:
         controller, times = controllers[0], np.empty(count)
-        for place, inputs in enumerate(given[-count:]):
+        for place, row in enumerate(inputs[-count:]):
             begun = perf_counter_ns()
-            controller.tick(*inputs)
+            controller.tick(*row)
             times[place] = perf_counter_ns() - begun
-        takes.times.append(times)
-        takes.active.append(controller.saturated / count)
+        control.times.append(times)
+        control.active.append(controller.saturated / count)
 
-    return Rival(begin, run, count)
+    return Operation(begin, run, count)
 
 
-def _loop_ticks() -> Rival:
-    """Step table, estimator and controller, holding where they are: their work is the same."""
+def _loop_ticks() -> Operation:
+    """Step table, estimator and controller while they hold, which takes as long as a motion."""
     loop = make_loop(load_scenario(SCENARIO))
 
     def begin() -> None:
-        # Late samples first come after a few ticks.
+        # Delayed samples arrive after a few ticks.
         loop.step()
         loop.arm()
 
@@ -501,49 +511,50 @@ def _loop_ticks() -> Rival:
         for _ in range(LOOP_TICKS):
             loop.step()
 
-    return Rival(begin, run, LOOP_TICKS)
+    return Operation(begin, run, LOOP_TICKS)
 
 
-def _mujoco_rivals(stretch: Stretch) -> dict[str, Rival]:
-    """Return MuJoCo's integrators, as delivered and without the stages that do nothing here."""
+def _mujoco_steps(stretch: Stretch) -> dict[str, Operation]:
+    """Return MuJoCo's integrators, with default stages and with the unused stages off."""
     state = _mujoco_state(stretch.start)
 
-    def rival(name: str, lean: bool) -> Rival:
+    def operation(name: str, lean: bool) -> Operation:
         linkage = MujocoLinkage(stretch.mechanism, replace(stiff(name, STEP), lean=lean))
 
         def begin() -> None:
             linkage.set_state(state)
             linkage.apply(stretch.torques)
 
-        return Rival(begin, lambda: linkage.advance(MUJOCO_STEPS), MUJOCO_STEPS)
+        return Operation(begin, lambda: linkage.advance(MUJOCO_STEPS), MUJOCO_STEPS)
 
-    return {f'mujoco_{name.lower()}{"_lean" if lean else ""}_step_ns': rival(name, lean)
+    return {f'mujoco_{name.lower()}{"_lean" if lean else ""}_step_ns': operation(name, lean)
             for name in ('Euler', 'RK4') for lean in (False, True)}
 
 
-def _race(rivals: Mapping[str, Rival], rounds: Iterable[Any]) -> dict[str, float]:
+def _time_in_turns(operations: Mapping[str, Operation], rounds: Iterable[Any]
+                   ) -> dict[str, float]:
     """
-    Let the rivals take turns, and fresh processes among them.
+    Time all operations in turn, and fresh processes between them.
 
-    :returns: the least time of each rival [ns per count], and `import_to_first_step_s`.
+    :returns: the least time of each operation [ns per count], and `import_to_first_step_s`.
     """
-    least = dict.fromkeys([*rivals, 'import_to_first_step_s'], float('inf'))
+    least = dict.fromkeys([*operations, 'import_to_first_step_s'], float('inf'))
     for turn, _ in enumerate(rounds):
-        for name, rival in rivals.items():
-            rival.begin()
+        for name, operation in operations.items():
+            operation.begin()
             begin = perf_counter_ns()
-            rival.run()
-            taken = (perf_counter_ns() - begin) / rival.count
+            operation.run()
+            duration = (perf_counter_ns() - begin) / operation.count
             # The first round may compile, and warms up.
             if turn > 0:
-                least[name] = min(least[name], taken)
+                least[name] = min(least[name], duration)
         if turn % FRESH_PROCESS_EVERY == 0:
             least['import_to_first_step_s'] = min(least['import_to_first_step_s'], _first_step())
     return least
 
 
 def _first_step() -> float:
-    """Time a fresh process from its first import of ours to the end of its first step [s]."""
+    """Time a fresh process from the first import of this package to the end of a step [s]."""
     done = subprocess.run([sys.executable, '-c', FIRST_STEP, *sys.path], capture_output=True,
                           text=True, check=False)
     if done.returncode:

@@ -7,7 +7,7 @@ How well a linkage can be moved over its configurations, for many linkages at on
 cond(A) of paper eq. 6 is one answer, and depends on which two angles are the axes. What does not:
 how near a change point is, which inertia the motions have, and what wheels can do. For these the
 motions that the closure admits, `J omega = 0`, are measured by the rates of all four links, in an
-orthonormal basis N of them (docs/studies.md, conditioning).
+orthonormal basis N of them (docs/studies/conditioning.md).
 """
 
 from __future__ import annotations

@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Ten minutes of commands and samples between the host and emulated links, over UDP on loopback.
+Lost frames and round trips between the host and emulated links in ten minutes, over UDP.
 
-Two processes, no ROS: what is timed is the bus, its language, and what both ends make of it.
+Two processes on loopback, without ROS: the round trip includes the bus, the message codec and the
+processing at both ends.
 """
 
 from __future__ import annotations
 
-import io
 from multiprocessing import get_context
 from multiprocessing.synchronize import Event
 import time
@@ -32,40 +32,39 @@ from fourbar_ros.plant import InitialState, load_table, Plant
 from fourbar_ros.plotting import style
 from fourbar_ros.plotting.style import COLOURS
 from fourbar_ros.studies import Result, StudyError
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 import numpy as np
 
 SECONDS = 600
 PERIOD_NS = 4_000_000
-# A tick of the node waits so long for the answers of the wheels [s]; here it waits longer than any
-# limit, to see how long it takes.
-NODE_WAITS_S, ANSWER_TIMEOUT_S = 2e-3, 2e-2
-# So long everything may take to come up [s].
+# Answer timeout of the node [s], and the one of the study, which exceeds every limit so that it
+# measures late answers as well.
+NODE_TIMEOUT_S, ANSWER_TIMEOUT_S = 2e-3, 2e-2
+# Timeout of the start of the emulated links and of arming [s].
 START_UP_S = 30.0
-# The wheels are pushed to and fro, gently [N m], for so many ticks each way.
-TORQUE, TICKS_EACH_WAY = 1e-3, 250
+# Torque on the wheels, whose sign alternates every second [N m], and ticks before arming.
+TORQUE, IDLE_TICKS = 1e-3, 250
 MEDIAN_MS, SLOWEST_MS = 1.0, 5.0
 NO_TORQUE = Drive(np.zeros(4), np.zeros(4, dtype=bool), np.zeros(4, dtype=bool))
-DPI = 120
 
-# Counters of a link, at the host, that stand for frames which did not make it. An answer that came
-# when its tick did not wait for it any more is not lost, but the tick went on without it.
+# Counters of lost frames of a link at the host. An answer that arrives after the timeout of its
+# tick is late and not lost.
 LOST = ('lost_angles', 'lost_heartbeats', 'replayed', 'wrong_time')
 
 
 def run(progress: Progress, seconds: int = SECONDS) -> Result:
-    """Drive emulated links for so long, and count and time what comes back."""
-    # Compiled here, where that is announced, and kept for the process of the links.
+    """Drive emulated links for a number of seconds; count lost frames and time the answers."""
+    # Compiles here, where it is announced, and caches for the process of the links.
     _emulator()
     context = get_context('spawn')
     stop, (here, there) = context.Event(), context.Pipe()
-    links = context.Process(target=_be_links, args=(stop, there), daemon=True)
+    links = context.Process(target=_serve_links, args=(stop, there), daemon=True)
     host = UdpBus('127.0.0.1:0', peers=())
     links.start()
     try:
         if not here.poll(START_UP_S):
-            raise StudyError(f'the emulated links did not start within {START_UP_S:g} s')
+            raise StudyError(f'the emulated links did not start within {START_UP_S:g} s',
+                             limit=START_UP_S)
         host.add_peer(here.recv())
         here.send(_address(host))
         prototype = Prototype(
@@ -76,12 +75,12 @@ def run(progress: Progress, seconds: int = SECONDS) -> Result:
         round_trips, counts = _drive(prototype, progress, seconds)
         prototype.close()
         stop.set()
-        told = here.recv() if here.poll(START_UP_S) else {}
+        lost = here.recv() if here.poll(START_UP_S) else {}
     finally:
         stop.set()
         links.join(START_UP_S)
         host.shutdown()
-    return _result({**counts, **told}, round_trips, seconds)
+    return _result({**counts, **lost}, round_trips, seconds)
 
 
 def _address(bus: UdpBus) -> str:
@@ -90,7 +89,7 @@ def _address(bus: UdpBus) -> str:
 
 
 def _emulator() -> Emulator:
-    """Make the four links, everything compiled before somebody speaks to them."""
+    """Make the emulator of the four links, with its kernels compiled."""
     plant = Plant(load_mechanism('prototype'), load_table('prototype'), InitialState(), 5e-4,
                   np.random.default_rng(0))
     emulator = Emulator(
@@ -100,8 +99,8 @@ def _emulator() -> Emulator:
     return emulator
 
 
-def _be_links(stop: Event, host: Any) -> None:
-    """Be the four links, until told to stop; then tell what was lost on the way here."""
+def _serve_links(stop: Event, host: Any) -> None:
+    """Serve the four links until the stop event, then send the counts of lost commands."""
     emulator = _emulator()
     bus = UdpBus('127.0.0.1:0', peers=())
     host.send(_address(bus))
@@ -109,14 +108,14 @@ def _be_links(stop: Event, host: Any) -> None:
     port = Port(bus, 'fourbar_udp', _address(bus))
     while not stop.is_set():
         emulator.serve(port, monotonic_ns)
-    host.send({f'commands_{kind}': sum(one.counts[kind] for one in emulator.firmware)
+    host.send({f'commands_{kind}': sum(link.counts[kind] for link in emulator.firmware)
                for kind in ('lost_commands', 'replayed')})
     port.close()
 
 
 def _drive(prototype: Prototype, progress: Progress, seconds: int
            ) -> tuple[Array, dict[str, int]]:
-    """Return the round trips of the ticks, at most the time-out, and counts."""
+    """Return the round trips of the ticks [s], limited to the timeout, and counts."""
     begin_ns, tick = monotonic_ns(), 0
 
     def step(drive: Drive) -> float | None:
@@ -127,23 +126,23 @@ def _drive(prototype: Prototype, progress: Progress, seconds: int
             time.sleep(ahead_ns * 1e-9)
         return prototype.step(due_ns, drive).timing[0]
 
-    while prototype.arming_blockers() or tick < TICKS_EACH_WAY:
+    while prototype.arming_blockers() or tick < IDLE_TICKS:
         step(NO_TORQUE)
         if tick * PERIOD_NS > START_UP_S * 1e9:
-            raise StudyError(f'cannot be armed: {"; ".join(prototype.arming_blockers())}')
+            raise StudyError(f'cannot arm: {"; ".join(prototype.arming_blockers())}')
     _arm(prototype)
-    before, found, missing = _counts(prototype), [], 0
+    before, round_trips, missing = _counts(prototype), [], 0
     for second in progress(range(seconds), seconds):
         torque = TORQUE if second % 2 else -TORQUE
         drive = Drive(np.full(4, torque), np.zeros(4, dtype=bool), np.ones(4, dtype=bool))
         for _ in range(round(1e9) // PERIOD_NS):
-            answered = step(drive)
-            found.append(ANSWER_TIMEOUT_S if answered is None else answered)
+            round_trip = step(drive)
+            round_trips.append(ANSWER_TIMEOUT_S if round_trip is None else round_trip)
             missing += sum(link.missing for link in prototype.links)
             prototype.drive(drive)
     step(NO_TORQUE)
     counts = {kind: count - before[kind] for kind, count in _counts(prototype).items()}
-    return np.array(found), {**counts, 'lost_answers': missing - counts['late']}
+    return np.array(round_trips), {**counts, 'lost_answers': missing - counts['late']}
 
 
 def _arm(device: Device) -> None:
@@ -160,7 +159,7 @@ def _counts(prototype: Prototype) -> dict[str, int]:
 def _result(counts: dict[str, int], round_trips: Array, seconds: int) -> Result:
     lost = sum(count for kind, count in counts.items()
                if kind != 'late' and not kind.startswith('frames_'))
-    late = int((round_trips > NODE_WAITS_S).sum())
+    late = int((round_trips > NODE_TIMEOUT_S).sum())
     middle, slow, slowest = np.percentile(round_trips * 1e3, [50.0, 99.0, 100.0]).tolist()
     data = {**counts, 'seconds': seconds, 'ticks': len(round_trips),
             'ticks_later_than_the_node_waits': late, 'round_trip_p50_ms': middle,
@@ -168,9 +167,9 @@ def _result(counts: dict[str, int], round_trips: Array, seconds: int) -> Result:
     text = '\n'.join([
         f'{len(round_trips)} ticks, {counts["frames_sent"]} frames to the links, '
         f'{counts["frames_received"]} from them',
-        f'round trip, from the question to the last of eight answers: median {middle:.3f} ms, '
-        f'99 % {slow:.3f} ms, slowest {slowest:.3f} ms; {late} took longer than the '
-        f'{NODE_WAITS_S * 1e3:g} ms for which the node waits'])
+        f'round trip, from the request to the last of eight answers: median {middle:.3f} ms, '
+        f'99 % {slow:.3f} ms, maximum {slowest:.3f} ms; {late} exceed the answer timeout of '
+        f'{NODE_TIMEOUT_S * 1e3:g} ms of the node'])
     checks = [at_most('frames_lost', lost, '', 0),
               at_least('frames_received', counts['frames_received'], '', 12.0 * len(round_trips)
                        * 0.97),
@@ -179,20 +178,17 @@ def _result(counts: dict[str, int], round_trips: Array, seconds: int) -> Result:
     return Result(checks, data, text, {'bus.png': _png(round_trips * 1e3)})
 
 
-def _png(round_trips: Array) -> bytes:
-    """Draw how many of the round trips took longer than so long."""
-    with rc_context(style.RC):
-        figure = Figure(figsize=(style.WIDTH_IN, 3.2), layout='constrained')
-        axes = figure.subplots()
-        ordered = np.sort(round_trips)
-        axes.plot(ordered, 1.0 - np.arange(len(ordered)) / len(ordered), color=COLOURS['link_a'])
-        for limit, share in ((MEDIAN_MS, 0.5), (SLOWEST_MS, 0.01)):
-            axes.plot(limit, share, 'v', color=COLOURS['limit'])
-            axes.annotate(f'limit {limit:g} ms', (limit, share), (6, 4),
-                          textcoords='offset points', color=COLOURS['limit'])
-        axes.set(xscale='log', yscale='log', xlabel='round trip [ms]',
-                 ylabel='share that took longer', ylim=(0.5 / len(ordered), 1.3))
-        axes.set_title('From the question of a tick to the last answer')
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format='png', dpi=DPI, facecolor=COLOURS['paper'])
-        return buffer.getvalue()
+@style.as_png
+def _png(round_trips: Array) -> Figure:
+    """Draw the share of round trips that exceed a duration [ms]."""
+    figure, axes = style.panels(3.2, 1, 1)
+    ordered = np.sort(round_trips)
+    axes.plot(ordered, 1.0 - np.arange(len(ordered)) / len(ordered), color=COLOURS['link_a'])
+    for limit, share in ((MEDIAN_MS, 0.5), (SLOWEST_MS, 0.01)):
+        axes.plot(limit, share, 'v', color=COLOURS['limit'])
+        axes.annotate(f'limit {limit:g} ms', (limit, share), (6, 4),
+                      textcoords='offset points', color=COLOURS['limit'])
+    axes.set(xscale='log', yscale='log', xlabel='round trip [ms]',
+             ylabel='share that took longer', ylim=(0.5 / len(ordered), 1.3))
+    axes.set_title('From the request of a tick to the last answer')
+    return figure

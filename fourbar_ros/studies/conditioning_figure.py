@@ -1,33 +1,31 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The figures of the study of conditioning: Fig. 6 of the paper, and what it hides."""
+"""Figures of the conditioning study: Fig. 6 of the paper, and linkages near a change point."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-import io
 
 from fourbar_ros.mechanism.conditioning import Conditioning
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plotting import style
 from fourbar_ros.plotting.style import COLOURS, LINK_COLOURS
-from fourbar_ros.studies.conditioning import (
+from fourbar_ros.studies.conditioning_linkages import (
     condition,
     LENGTH,
-    Look,
+    LinkageConditioning,
     OFFSETS,
     parallelogram,
     RATIOS,
     SIGNS,
-    SOUGHT,
     span,
+    SPAN_OFFSETS,
     SQUARE,
     STABLE,
     THETAS,
     worst_of_three,
 )
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap
 from matplotlib.contour import QuadContourSet
@@ -36,77 +34,86 @@ import numpy as np
 
 LEVELS = (1.0, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 8.0, 12.0)
 LABELLED = (1.1, 1.5, 3.0)
-EXPLAINED = {'same': 'one sign in\nall body frames', 'inside': 'towards\nthe centre'}
+CONVENTIONS = {'same': 'one sign in\nall body frames', 'inside': 'towards\nthe centre'}
 SIGN_COLOURS = {'same': LINK_COLOURS[0], 'inside': LINK_COLOURS[1]}
 BRANCH_DASHES = {'open': '-', 'crossed': (0, (3, 2))}
-WIDEST = 1e3 * SOUGHT[-1]    # mm
+WIDEST = 1e3 * SPAN_OFFSETS[-1]    # mm
 MOST_CONDITION = 1e3
-DPI = 120
+RATIO_TICKS = {value: f'{value:g}' for value in (0.25, 0.5, 1.0, 2.0, 4.0)}
 
 
-def png(grids: Mapping[str, Conditioning]) -> bytes:
-    """Draw cond(A) over theta and ratio, over theta and offset, and how far each stays stable."""
-    with rc_context(style.RC):
-        figure = Figure(figsize=(style.WIDTH_IN, 6.6), layout='constrained')
-        panels = figure.subplots(2, 3, height_ratios=(1.15, 1.0))
-        filled = _contours(panels[0, 0], RATIOS, grids['ratio'].condition)
-        panels[0, 0].set(yscale='log', ylabel=r'$l_a / l_b$')
-        panels[0, 0].set_yticks((0.25, 0.5, 1.0, 2.0, 4.0), ('0.25', '0.5', '1', '2', '4'))
-        panels[0, 0].minorticks_off()
-        panels[0, 0].set_title('a. Fig. 6a: length ratio')
-        for axes, name, letter in ((panels[0, 1], 'same', 'b'), (panels[0, 2], 'inside', 'c')):
-            _contours(axes, 1e3 * OFFSETS, grids[name].condition)
-            axes.set_ylabel('offset y [mm]')
-            axes.set_title(f'{letter}. Fig. 6b, offset {name!r}')
-        bar = figure.colorbar(filled, ax=panels[0].tolist(), ticks=LEVELS, shrink=0.95,
-                              format='%g', pad=0.015)
-        bar.set_label(r'cond $\mathbf{A}$')
-        bar.outline.set_visible(False)
-        bar.ax.minorticks_off()
-        _ratios(panels[1, 0])
-        _sketches(panels[1, 1])
-        _spans(panels[1, 2])
-        return _saved(figure)
+@style.as_png
+def png(grids: Mapping[str, Conditioning]) -> Figure:
+    """Draw cond(A) over theta and ratio, over theta and offset, and the spans of offsets."""
+    figure, panels = style.panels(6.6, 2, 3, height_ratios=(1.15, 1.0))
+    filled = _contours(panels[0, 0], RATIOS, grids['ratio'].condition)
+    panels[0, 0].set(yscale='log', ylabel=r'$l_a / l_b$')
+    panels[0, 0].set_yticks(*zip(*RATIO_TICKS.items()))
+    panels[0, 0].minorticks_off()
+    panels[0, 0].set_title('a. Fig. 6a: length ratio')
+    for axes, name, letter in ((panels[0, 1], 'same', 'b'), (panels[0, 2], 'inside', 'c')):
+        _contours(axes, 1e3 * OFFSETS, grids[name].condition)
+        axes.set_ylabel('offset y [mm]')
+        axes.set_title(f'{letter}. Fig. 6b, offset {name!r}')
+    bar = figure.colorbar(filled, ax=panels[0].tolist(), ticks=LEVELS, shrink=0.95,
+                          format='%g', pad=0.015)
+    bar.set_label(r'cond $\mathbf{A}$')
+    bar.outline.set_visible(False)
+    bar.ax.minorticks_off()
+    _ratios(panels[1, 0])
+    _sketches(panels[1, 1])
+    _spans(panels[1, 2])
+    return figure
 
 
-def looks_png(looks: Sequence[Look]) -> bytes:
-    """Draw, of each linkage, cond(A), distance to change points, and what wheels can do."""
-    with rc_context(style.RC):
-        figure = Figure(figsize=(style.WIDTH_IN, 7.2), layout='constrained')
-        panels = figure.subplots(3, len(looks), sharex='col', sharey='row', squeeze=False)
-        for column, look in enumerate(looks):
-            for branch, found in look.branches.items():
-                _condition(panels[0, column], look, branch, found)
-                _distance(panels[1, column], look, branch, found)
-                _gains(panels[2, column], look, branch, found)
-            panels[0, column].set_title(f'{look.title}: condition number')
-            panels[1, column].set_title('distance to a change point (0: on it)')
-            panels[2, column].set_title('what wheels can do along the motion they drive least')
-            panels[2, column].set_xlabel(r'$\theta = \phi_b - \phi_a$ [deg]')
-            _blank(list(panels[:, column]), look)
-        panels[0, 0].set_ylabel('cond')
-        panels[0, 0].set_ylim(0.9, MOST_CONDITION)
-        panels[1, 0].set_ylim(-0.03, 1.05)
-        panels[2, 0].set_ylabel('gain')
-        panels[2, 0].set_ylim(-0.04, 1.08)
-        for row in panels:
-            row[-1].legend(loc='upper left', bbox_to_anchor=(1.0, 1.0))
-        return _saved(figure)
+@style.as_png
+def linkages_png(linkages: Sequence[LinkageConditioning]) -> Figure:
+    """Draw, for each linkage, cond(A), distance to change points, and gains of the wheels."""
+    figure, panels = style.panels(7.2, 3, len(linkages), sharex='col', sharey='row', squeeze=False)
+    for column, linkage in zip(panels.T, linkages):
+        for branch, conditioning in linkage.branches.items():
+            for axes, curves in zip(column, _curves(conditioning)):
+                for values, label, colour, width in curves:
+                    axes.plot(np.degrees(linkage.thetas), values[0], color=colour,
+                              linestyle=BRANCH_DASHES[branch], linewidth=width,
+                              label=label if len(linkage.branches) == 1 else f'{label}, {branch}')
+        column[0].set_title(f'{linkage.title}: condition number')
+        column[1].set_title('distance to a change point (0: on it)')
+        column[2].set_title('gain of the wheels along their weakest motion')
+        column[2].set_xlabel(r'$\theta = \phi_b - \phi_a$ [deg]')
+        _shade(column, linkage)
+    panels[0, 0].set(yscale='log', ylabel='cond', ylim=(0.9, MOST_CONDITION))
+    panels[1, 0].set_ylim(-0.03, 1.05)
+    panels[2, 0].set(ylabel='gain', ylim=(-0.04, 1.08))
+    for row in panels:
+        row[-1].legend(loc='upper left', bbox_to_anchor=(1.0, 1.0))
+    return figure
 
 
-def _saved(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format='png', dpi=DPI, facecolor=COLOURS['paper'])
-    return buffer.getvalue()
+def _curves(conditioning: Conditioning) -> tuple[list[tuple[Array, str, str, float]], ...]:
+    """Return values, label, colour and width of all curves, for each of the three panels."""
+    highest, gains = 10.0 * MOST_CONDITION, conditioning.gains
+    return ([
+        (np.minimum(conditioning.condition, highest), r'cond $\mathbf{A}$, axes a and b',
+         LINK_COLOURS[0], 1.4),
+        (np.minimum(conditioning.condition_of_motions, highest), 'of the motions, any axes',
+         COLOURS['muted'], 1.4)], [
+        (conditioning.closure_ratio, 'singular values of J, ratio', LINK_COLOURS[0], 1.4),
+        (conditioning.alignment, r'$|\sin(\phi_d - \phi_c)|$', COLOURS['muted'], 1.4)], [
+        (gains[..., 0], 'four wheels', LINK_COLOURS[0], 1.4),
+        # The wider line stays visible where two curves coincide.
+        (worst_of_three(conditioning), 'three, worst one lost', LINK_COLOURS[2], 4.0),
+        (gains[..., 5], 'two, a and b', LINK_COLOURS[1], 1.4),
+        (gains[..., 6], 'two, a and c', LINK_COLOURS[3], 1.4)])
 
 
-def _contours(axes: Axes, values: Array, found: Array) -> QuadContourSet:
+def _contours(axes: Axes, values: Array, conditions: Array) -> QuadContourSet:
     colours = LinearSegmentedColormap.from_list(
         'condition', [COLOURS['tile'], '#9cc3dd', LINK_COLOURS[0], COLOURS['ink']])
     degrees = np.degrees(THETAS)
-    filled = axes.contourf(degrees, values, np.maximum(found, 1.0), levels=LEVELS, cmap=colours,
-                           norm=BoundaryNorm(LEVELS, colours.N), extend='max')
-    lines = axes.contour(degrees, values, found, levels=LABELLED, colors=COLOURS['ink'],
+    filled = axes.contourf(degrees, values, np.maximum(conditions, 1.0), levels=LEVELS,
+                           cmap=colours, norm=BoundaryNorm(LEVELS, colours.N), extend='max')
+    lines = axes.contour(degrees, values, conditions, levels=LABELLED, colors=COLOURS['ink'],
                          linewidths=0.6)
     axes.clabel(lines, fmt='%g', fontsize=7.5)
     axes.set_xlabel(r'$\theta$ [deg]')
@@ -123,14 +130,14 @@ def _ratios(axes: Axes) -> None:
                   label=label)
     axes.set(xscale='log', xlabel=r'$l_a / l_b$', ylabel=r'cond $\mathbf{A}$ (any $\theta$)')
     style.log_ticks(axes)
-    axes.set_xticks((0.25, 0.5, 1.0, 2.0, 4.0), ('0.25', '0.5', '1', '2', '4'))
+    axes.set_xticks(*zip(*RATIO_TICKS.items()))
     axes.minorticks_off()
     axes.set_title('d. Unequal lengths always cost')
     axes.legend(loc='upper center')
 
 
 def _sketches(axes: Axes) -> None:
-    """Draw where the mass centres are in either convention."""
+    """Draw the mass centres in both conventions."""
     axes.set_aspect('equal')
     axes.axis('off')
     theta, offset = np.radians(60.0), 0.25 * LENGTH
@@ -141,19 +148,19 @@ def _sketches(axes: Axes) -> None:
         low = -1.35 * number
         base = np.array([0.0, low])
         for letter, sign, colour in zip('abcd', SIGNS[name], LINK_COLOURS):
-            near, way = base + starts[letter], along[letter]
-            axes.plot(*np.array([near, near + way]).T, color=colour, linewidth=3.0)
-            middle = near + 0.5 * way
-            centre = middle + sign * offset / LENGTH * np.array([-way[1], way[0]])
+            near, direction = base + starts[letter], along[letter]
+            axes.plot(*np.array([near, near + direction]).T, color=colour, linewidth=3.0)
+            middle = near + 0.5 * direction
+            centre = middle + sign * offset / LENGTH * np.array([-direction[1], direction[0]])
             axes.annotate('', centre, middle, arrowprops={
                 'arrowstyle': '-|>', 'color': colour, 'shrinkA': 0.0, 'shrinkB': 0.0,
                 'mutation_scale': 14.0, 'linewidth': 1.6})
-            axes.annotate(letter, near + 0.2 * way, ha='center', va='center', color=colour,
+            axes.annotate(letter, near + 0.2 * direction, ha='center', va='center', color=colour,
                           fontweight='bold', bbox={
                               'facecolor': COLOURS['paper'], 'edgecolor': 'none', 'pad': 0.8})
         axes.annotate(f"'{name}'", (1.65, low + 0.55), color=SIGN_COLOURS[name],
                       fontweight='bold')
-        axes.annotate(EXPLAINED[name], (1.65, low + 0.5), va='top', fontsize=8.0,
+        axes.annotate(CONVENTIONS[name], (1.65, low + 0.5), va='top', fontsize=8.0,
                       color=COLOURS['muted'])
     axes.set(xlim=(-0.3, 2.9), ylim=(-1.5, 1.15))
     axes.set_title('e. Where y > 0 puts the mass centres')
@@ -172,48 +179,13 @@ def _spans(axes: Axes) -> None:
     axes.legend(loc='center right')
 
 
-def _condition(axes: Axes, look: Look, branch: str, found: Conditioning) -> None:
-    dashes = BRANCH_DASHES[branch]
-    for values, label, colour in (
-            (found.condition, r'cond $\mathbf{A}$, axes a and b', LINK_COLOURS[0]),
-            (found.condition_of_motions, 'of the motions, any axes', COLOURS['muted'])):
-        axes.plot(np.degrees(look.thetas), np.minimum(values[0], 10.0 * MOST_CONDITION),
-                  color=colour, linestyle=dashes, label=_label(label, look, branch))
-    axes.set_yscale('log')
-
-
-def _distance(axes: Axes, look: Look, branch: str, found: Conditioning) -> None:
-    dashes = BRANCH_DASHES[branch]
-    for values, label, colour in (
-            (found.closure_ratio, 'singular values of J, ratio', LINK_COLOURS[0]),
-            (found.alignment, r'$|\sin(\phi_d - \phi_c)|$', COLOURS['muted'])):
-        axes.plot(np.degrees(look.thetas), values[0], color=colour, linestyle=dashes,
-                  label=_label(label, look, branch))
-
-
-def _gains(axes: Axes, look: Look, branch: str, found: Conditioning) -> None:
-    dashes = BRANCH_DASHES[branch]
-    # The wider line shows on both sides where two coincide.
-    for values, label, colour, width in (
-            (found.gains[..., 0], 'four wheels', LINK_COLOURS[0], 1.4),
-            (worst_of_three(found), 'three, worst one lost', LINK_COLOURS[2], 4.0),
-            (found.gains[..., 5], 'two, a and b', LINK_COLOURS[1], 1.4),
-            (found.gains[..., 6], 'two, a and c', LINK_COLOURS[3], 1.4)):
-        axes.plot(np.degrees(look.thetas), values[0], color=colour, linestyle=dashes,
-                  linewidth=width, label=_label(label, look, branch))
-
-
-def _label(label: str, look: Look, branch: str) -> str:
-    return label if len(look.branches) == 1 else f'{label}, {branch}'
-
-
-def _blank(column: Sequence[Axes], look: Look) -> None:
+def _shade(column: Sequence[Axes], linkage: LinkageConditioning) -> None:
     """Shade where the loop cannot close on any branch."""
-    closed = np.any([np.isfinite(found.closure_ratio[0]) for found in look.branches.values()],
-                    axis=0)
-    # A single point is a change point, where nothing is blank to the eye.
+    closed = np.any([np.isfinite(conditioning.closure_ratio[0])
+                     for conditioning in linkage.branches.values()], axis=0)
+    # A single point is a change point and too narrow to see.
     if np.count_nonzero(~closed) > 2:
-        degrees = np.degrees(look.thetas)
+        degrees = np.degrees(linkage.thetas)
         for axes in column:
             axes.fill_between(degrees, 0.0, 1.0, where=~closed, color=COLOURS['grid'],
                               transform=axes.get_xaxis_transform(), linewidth=0.0)

@@ -27,7 +27,6 @@ from fourbar_ros.mechanism.forces import forces_along
 from fourbar_ros.plant import load_table, Table
 from fourbar_ros.plant.table import surroundings_of
 from fourbar_ros.studies import figures, Result
-from fourbar_ros.studies.actuation_cost import ActuationCost, peak, rest_to_rest
 from fourbar_ros.studies.design_model import (
     BEAM,
     Design,
@@ -45,6 +44,7 @@ from fourbar_ros.studies.design_model import (
     with_ratio,
     with_wheels,
 )
+from fourbar_ros.studies.planned_cost import ActuationCost, peak, rest_to_rest
 import numpy as np
 from scipy.integrate import trapezoid
 

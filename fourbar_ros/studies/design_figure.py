@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 from fourbar_ros.plotting import style
 from fourbar_ros.plotting.style import COLOURS
-from fourbar_ros.studies.actuation_cost import peak
 from fourbar_ros.studies.design_model import Design, MANOEUVRES, SPEED_SHARE, TITLES
+from fourbar_ros.studies.planned_cost import peak
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator

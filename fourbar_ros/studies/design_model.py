@@ -12,7 +12,7 @@ from typing import Any
 
 from fourbar_ros.mechanism import assemble, Mechanism
 from fourbar_ros.plant import Table
-from fourbar_ros.studies.actuation_cost import (
+from fourbar_ros.studies.planned_cost import (
     actuation_cost,
     ActuationCost,
     peak,

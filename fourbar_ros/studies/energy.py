@@ -23,7 +23,7 @@ from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.state import make_state
 from fourbar_ros.studies import figures, Result
-from fourbar_ros.studies.actuation_cost import (
+from fourbar_ros.studies.planned_cost import (
     actuation_cost,
     ActuationCost,
     peak,

@@ -10,7 +10,7 @@ from typing import Any
 
 from fourbar_ros.plotting import style
 from fourbar_ros.plotting.style import COLOURS, LINK_COLOURS, LINK_DASHES
-from fourbar_ros.studies.actuation_cost import ActuationCost
+from fourbar_ros.studies.planned_cost import ActuationCost
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Motions of ours beside those of independent engines, as far as these are installed.
+Motions of this package compared with those of independent engines, as far as installed.
 
-Torques and the angles of prescribed wheels are cosines of time (`Case`). How an engine samples
-them differs, and decides how close it can come.
+Torques and the angles of prescribed wheels are cosines of time (`Case`). The way in which an
+engine samples them limits its accuracy.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ MUJOCO_STEPS = {'mujoco_2ms': 2e-3, 'mujoco_1ms': 1e-3}
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class ComparedMotion:
     """
-    One motion to compare.
+    A motion to compare.
 
-    :param name: what it is called in tables.
-    :param case: what to simulate.
-    :param reference: (n, 4) link angles known beforehand [rad], or None.
+    :param name: its name in tables.
+    :param case: the simulated case.
+    :param reference: (n, 4) known link angles [rad], or None.
     """
 
     name: str
@@ -42,28 +42,28 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Engine:
+class IndependentEngine:
     """
-    Somebody else's way to the same motion.
+    An independent implementation of the dynamics.
 
-    :param torque: how it samples the torques.
-    :param follow: a trial to its link angles (n, 4) [rad]; None if it does not do this one.
+    :param sampling: how it samples the torques.
+    :param simulate: maps a motion to its link angles (n, 4) [rad]; None if not applicable.
     """
 
-    torque: str
-    follow: Callable[[Trial], Array | None]
+    sampling: str
+    simulate: Callable[[ComparedMotion], Array | None]
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
-    """A trial, our motion, and the link angles (n, 4) of others by engine [rad]."""
+class EngineComparison:
+    """A motion as simulated here, and link angles (n, 4) by name of the other engines [rad]."""
 
-    trial: Trial
+    motion: ComparedMotion
     ours: Motion
     others: dict[str, Array]
 
     def differences(self, engine: str) -> Array:
-        """Return ours minus theirs (n, 4) [rad]."""
+        """Return our link angles minus those of an engine (n, 4) [rad]."""
         return self.ours.link_angles - self.others[engine]
 
     def largest(self, engine: str) -> float:
@@ -75,68 +75,68 @@ class Comparison:
         return float(np.sqrt(np.mean(self.differences(engine)**2)))
 
 
-def compare(trials: Sequence[Trial], progress: Progress
-            ) -> tuple[list[Comparison], dict[str, str], list[str]]:
+def compare(motions: Sequence[ComparedMotion], progress: Progress
+            ) -> tuple[list[EngineComparison], dict[str, str], list[str]]:
     """
-    Follow all trials with all engines.
+    Simulate all motions with all engines.
 
-    :returns: a comparison for each trial, how each engine samples the torques, and in a line
-        each what was left out.
+    :returns: a comparison for each motion, the sampling of the torques by engine, and one line for
+        each engine that is missing.
     """
-    others, skipped = engines()
-    jobs = [(trial, name) for trial in trials for name in ('ours', *others)]
+    engines, skipped = available_engines()
+    jobs = [(motion, name) for motion in motions for name in ('ours', *engines)]
     ours: dict[str, Motion] = {}
-    followed: dict[str, dict[str, Array]] = {trial.name: {} for trial in trials}
-    for trial, name in progress(jobs, len(jobs)):
+    others: dict[str, dict[str, Array]] = {motion.name: {} for motion in motions}
+    for motion, name in progress(jobs, len(jobs)):
         if name == 'ours':
-            ours[trial.name] = simulate(trial.case, STEP)
-        elif (angles := others[name].follow(trial)) is not None:
-            followed[trial.name][name] = angles
+            ours[motion.name] = simulate(motion.case, STEP)
+        elif (angles := engines[name].simulate(motion)) is not None:
+            others[motion.name][name] = angles
 
-    rules = {name: engine.torque for name, engine in others.items()}
-    if set(MUJOCO_STEPS) <= set(rules):
-        rules['mujoco_extrapolated'] = (
+    sampling = {name: engine.sampling for name, engine in engines.items()}
+    if set(MUJOCO_STEPS) <= set(sampling):
+        sampling['mujoco_extrapolated'] = (
             'from these two to a step of zero, by what is of second order in it')
-        for angles_of in followed.values():
+        for angles_of in others.values():
             angles_of['mujoco_extrapolated'] = (
                 4.0 * angles_of['mujoco_1ms'] - angles_of['mujoco_2ms']) / 3.0
-    comparisons = [Comparison(trial, ours[trial.name], followed[trial.name]) for trial in trials]
-    return comparisons, rules, skipped
+    return ([EngineComparison(motion, ours[motion.name], others[motion.name])
+             for motion in motions], sampling, skipped)
 
 
-def engines() -> tuple[dict[str, Engine], list[str]]:
-    """Return the engines that can run here, by name, and which cannot and why."""
-    found = {'reference': Engine('continuous, model in maximal coordinates',
-                                 lambda trial: trial.reference)}
+def available_engines() -> tuple[dict[str, IndependentEngine], list[str]]:
+    """Return the installed engines by name, and one line for each missing one."""
+    engines = {'reference': IndependentEngine('continuous, model in maximal coordinates',
+                                              lambda motion: motion.reference)}
     skipped = []
     if installed('sympy'):
-        found['kane'] = Engine('continuous, DOP853 to 1e-12', _kane)
+        engines['kane'] = IndependentEngine('continuous, DOP853 to 1e-12', _kane)
     else:
         skipped.append('no comparison with the Kane derivation: sympy is missing')
     if installed('mujoco'):
         for name, step in MUJOCO_STEPS.items():
-            found[name] = Engine(
+            engines[name] = IndependentEngine(
                 f'held over each RK4 step of {1e3 * step:g} ms at its value in the middle',
                 partial(_mujoco, step=step))
     else:
         skipped.append('no comparison with MuJoCo: mujoco is missing')
-    return found, skipped
+    return engines, skipped
 
 
-def _kane(trial: Trial) -> Array:
+def _kane(motion: ComparedMotion) -> Array:
     from fourbar_ros.studies.independent import kane
-    return kane.simulate(trial.case).link_angles
+    return kane.simulate(motion.case).link_angles
 
 
-def _mujoco(trial: Trial, step: float) -> Array:
+def _mujoco(motion: ComparedMotion, step: float) -> Array:
     """
-    Follow a trial in MuJoCo with its closure stiff and the torques held over each step.
+    Simulate a motion in MuJoCo with a stiff closure and torques held over each step.
 
-    A prescribed wheel is locked to its link, its inertia added to it, and the link feels
+    A prescribed wheel is locked to its link and adds its inertia to it; the link is driven by
     `-If d2(psi)/dt2`.
     """
     from fourbar_ros.studies.independent.mujoco_model import MujocoLinkage, State, stiff
-    case = trial.case
+    case = motion.case
     turn = 2.0 * np.pi * case.frequency_hz
     scale = case.amplitude * np.where(
         case.prescribed, -case.mechanism.flywheel_inertias * turn**2, 1.0)

@@ -27,7 +27,6 @@ from fourbar_ros.mechanism import assemble, load_mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.state import make_state
 from fourbar_ros.studies import figures, Result, Sample, StudyError
-from fourbar_ros.studies.actuation_cost import simulate_torques
 from fourbar_ros.studies.campaigns.processes import in_processes
 from fourbar_ros.studies.energy import turn
 from fourbar_ros.studies.inertia_search import (
@@ -42,6 +41,7 @@ from fourbar_ros.studies.inertia_search import (
     SOFT_STEP,
     TURN,
 )
+from fourbar_ros.studies.planned_cost import simulate_torques
 import numpy as np
 from scipy.integrate import trapezoid
 

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Section 3 of the paper rerun, and reference motions, each beside independent engines.
+Comparison of the tests of paper section 3 and of reference motions with independent engines.
 
-The paper moves its wheels by given angles relative to their links. It does not print their
-amplitude: 100 rad is ours, and turns the links by 54 degrees.
+The paper prescribes the angles of its wheels relative to their links. It does not print their
+amplitude; the study uses 100 rad, which turns the links by 54 degrees.
 """
 
 from __future__ import annotations
@@ -20,7 +20,13 @@ from fourbar_ros.mechanism import angular_momentum, closure_error, load_mechanis
 from fourbar_ros.mechanism.case import Case, load_case
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.studies import figures, Result, StudyError
-from fourbar_ros.studies.engine_comparison import compare, Comparison, OURS, STEP, Trial
+from fourbar_ros.studies.engine_comparison import (
+    compare,
+    ComparedMotion,
+    EngineComparison,
+    OURS,
+    STEP,
+)
 import numpy as np
 
 AMPLITUDE = 100.0
@@ -36,13 +42,13 @@ PAPER_TESTS = {
 }
 REFERENCES = ('asymmetric', 'paper_all', 'paper_pair_ac', 'parallelogram_offset_spinning')
 
-# What ought to be equal, is so to rounding (1e-12 rad in the digits of the reference files).
+# Limit for quantities that are equal up to rounding, which is 1e-12 rad in the reference files.
 EXACT = 1e-9
-# A cosine held at the middle of each step is too large by (2 pi f h)^2 / 24 of itself, at 1 ms
-# and the 0.3 Hz of the fastest wheel 1.5e-7; and the motions are about a radian wide.
+# A cosine held at the middle of each step is too large by (2 pi f h)^2 / 24 of itself: 1.5e-7 at
+# 1 ms and the 0.3 Hz of the fastest wheel. The motions are about a radian wide.
 MUJOCO_LIMIT = 2e-7
-# Of second order in the step are that hold, and the give of joint 3, as the time constant of its
-# spring is a number of steps.
+# Ratio of errors at 2 ms and 1 ms. Both error sources are of second order in the step: the hold,
+# and the compliance of joint 3, whose time constant is a number of steps.
 ORDER_TWO = (3.5, 4.5)
 
 
@@ -50,42 +56,42 @@ def run(progress: Progress) -> Result:
     """
     Compare all motions.
 
-    :raises FourbarError: see :func:`trials`; or a motion that an engine gave up.
+    :raises FourbarError: see :func:`motions`; or an engine cannot simulate a motion.
     """
-    comparisons, rules, skipped = compare(trials(), progress)
-    files: dict[str, str | bytes] = {'validation.csv': _csv(comparisons, rules)}
+    comparisons, sampling, skipped = compare(motions(), progress)
+    files: dict[str, str | bytes] = {'validation.csv': _csv(comparisons, sampling)}
     with figures(skipped):
         from fourbar_ros.studies.validation_figure import png
         files['validation.png'] = png(comparisons[:len(PAPER_TESTS)])
-    return Result(checks(comparisons), _data(comparisons, rules), _table(comparisons, rules),
+    return Result(checks(comparisons), _data(comparisons, sampling), _table(comparisons, sampling),
                   files, skipped)
 
 
-def trials() -> list[Trial]:
+def motions() -> list[ComparedMotion]:
     """
     Return the paper's three tests, then the reference motions.
 
     :raises CaseError: the file of a reference motion is missing or broken.
-    :raises StudyError: it does not tell the link angles that it expects.
+    :raises StudyError: the file has no expected link angles.
     """
     paper = load_mechanism('paper')
-    found = [Trial(name, paper_test(paper, np.array(shape)))
-             for name, shape in PAPER_TESTS.items()]
+    listed = [ComparedMotion(name, paper_test(paper, np.array(shape)))
+              for name, shape in PAPER_TESTS.items()]
     for name in REFERENCES:
         path = share_directory() / 'config' / 'reference' / f'{name}.json'
         case = load_case(path)
         expected = np.array(json.loads(path.read_text(encoding='utf-8')).get('link_angles'))
         if expected.shape != (case.times.size, 4):
-            raise StudyError(f'{path}: link_angles must hold four angles for each t')
-        found.append(Trial(name, case, expected))
-    return found
+            raise StudyError(f'{path}: link_angles must have four angles for each t', path=path)
+        listed.append(ComparedMotion(name, case, expected))
+    return listed
 
 
 def paper_test(mechanism: Mechanism, shape: Array) -> Case:
     """
-    Return a test of section 3: every wheel's angle relative to its link is a cosine for 10 s.
+    Return a test of section 3: the angle of each wheel relative to its link is a cosine for 10 s.
 
-    :param shape: (4,) amplitudes in units of AMPLITUDE; 0 is a wheel at rest on its link.
+    :param shape: (4,) amplitudes in units of AMPLITUDE; 0: the wheel rests on its link.
     """
     rest = np.zeros(4)
     return Case(
@@ -94,51 +100,51 @@ def paper_test(mechanism: Mechanism, shape: Array) -> Case:
         times=TIMES, prescribed=np.ones(4, dtype=bool))
 
 
-def checks(comparisons: list[Comparison]) -> list[Check]:
-    """Return the checks on all comparisons; engines that did not run are left out."""
-    by_name = {comparison.trial.name: comparison for comparison in comparisons}
+def checks(comparisons: list[EngineComparison]) -> list[Check]:
+    """Return the checks on all comparisons; missing engines are left out."""
+    by_name = {comparison.motion.name: comparison for comparison in comparisons}
 
     def largest(engine: str) -> float:
         return max(comparison.largest(engine) for comparison in comparisons
                    if engine in comparison.others)
 
-    found = []
+    results = []
     for engine, limit in (('reference', EXACT), ('kane', EXACT), ('mujoco_1ms', MUJOCO_LIMIT),
                           ('mujoco_extrapolated', EXACT)):
         if any(engine in comparison.others for comparison in comparisons):
-            found.append(at_most(f'{engine}, largest difference', largest(engine), 'rad', limit))
+            results.append(at_most(f'{engine}, largest difference', largest(engine), 'rad', limit))
             if engine == 'mujoco_1ms':
                 ratios = [comparison.largest('mujoco_2ms') / comparison.largest('mujoco_1ms')
                           for comparison in comparisons]
-                found += [
+                results += [
                     within(f'mujoco, difference at 2 ms / at 1 ms, {word}', value, '', *ORDER_TWO)
                     for word, value in (('least', min(ratios)), ('most', max(ratios)))]
 
     turned = {name: by_name[name].ours.link_angles - START for name in PAPER_TESTS}
-    expected = turn_by_momentum(by_name['paper_test_1'].trial.case)[:, np.newaxis]
-    found += [at_most(name, float(np.abs(angles).max()), 'rad', EXACT) for name, angles in (
+    expected = turn_by_momentum(by_name['paper_test_1'].motion.case)[:, np.newaxis]
+    results += [at_most(name, float(np.abs(angles).max()), 'rad', EXACT) for name, angles in (
         ('test 1, a and c beside momentum by hand', turned['paper_test_1'][:, ::2] - expected),
         ('test 1, turn of b and d', turned['paper_test_1'][:, 1::2]),
         ('test 2, all links beside momentum by hand', turned['paper_test_2'] - expected),
         ('test 2, change of configuration', np.diff(turned['paper_test_2'], axis=1)),
         ('opposite commands, turn of any link', turned['paper_opposite']))]
-    found.append(at_most('momentum, drift relative to that of the wheels',
+    results.append(at_most('momentum, drift relative to that of the wheels',
                          max(map(momentum_drift, comparisons)), '', EXACT))
-    found.append(at_most('closure, widest gap', max(
-        closure_error(comparison.trial.case.mechanism, angles)
+    results.append(at_most('closure, widest gap', max(
+        closure_error(comparison.motion.case.mechanism, angles)
         for comparison in comparisons for angles in comparison.ours.link_angles), 'm', 1e-12))
-    return found
+    return results
 
 
 def turn_by_momentum(case: Case) -> Array:
     """
-    Work out by hand how far a pair of equal links turns that both wheels of it drive alike.
+    Return the turn of a pair of equal links with equal wheel motions, by conservation of momentum.
 
-    Of a parallelogram of identical uniform links each pair has the inertia `2 I + m l^2 / 2` in
-    every configuration, apart from the other pair. From rest its momentum stays zero,
+    In a parallelogram of identical uniform links each pair has the inertia `2 I + m l^2 / 2` in
+    every configuration, independent of the other pair. From rest its momentum stays zero,
     `(2 I + m l^2 / 2) omega + 2 If (omega + dpsi/dt) = 0`.
 
-    :param case: wheel a drives as both wheels of the pair.
+    :param case: both wheels of the pair move as wheel a.
     :returns: (n,) [rad].
     """
     mechanism = case.mechanism
@@ -152,9 +158,9 @@ def turn_by_momentum(case: Case) -> Array:
     return -share * float(case.amplitude[0]) * wave
 
 
-def momentum_drift(comparison: Comparison) -> float:
-    """Return how far our angular momentum leaves its start, relative to what the wheels had."""
-    mechanism, ours = comparison.trial.case.mechanism, comparison.ours
+def momentum_drift(comparison: EngineComparison) -> float:
+    """Return the drift of our angular momentum relative to the momentum of the wheels."""
+    mechanism, ours = comparison.motion.case.mechanism, comparison.ours
     speeds = ours.flywheel_speeds_absolute
     momentum = np.array([angular_momentum(mechanism, *state) for state in zip(
         ours.link_angles, ours.link_rates, speeds)])
@@ -162,42 +168,42 @@ def momentum_drift(comparison: Comparison) -> float:
     return float(np.abs(momentum - momentum[0]).max()) / scale
 
 
-def _rows(comparisons: list[Comparison], rules: dict[str, str]
+def _rows(comparisons: list[EngineComparison], sampling: dict[str, str]
           ) -> list[tuple[str, str, float, float]]:
-    """Return trial, engine, largest and rms difference [rad]."""
-    return [(comparison.trial.name, engine, comparison.largest(engine), comparison.rms(engine))
-            for comparison in comparisons for engine in rules if engine in comparison.others]
+    """Return motion, engine, largest and rms difference [rad]."""
+    return [(comparison.motion.name, engine, comparison.largest(engine), comparison.rms(engine))
+            for comparison in comparisons for engine in sampling if engine in comparison.others]
 
 
-def _csv(comparisons: list[Comparison], rules: dict[str, str]) -> str:
-    lines = [f'{trial},{engine},{largest:.4g},{rms:.4g},"{rules[engine]}"'
-             for trial, engine, largest, rms in _rows(comparisons, rules)]
+def _csv(comparisons: list[EngineComparison], sampling: dict[str, str]) -> str:
+    lines = [f'{motion},{engine},{largest:.4g},{rms:.4g},"{sampling[engine]}"'
+             for motion, engine, largest, rms in _rows(comparisons, sampling)]
     return '\n'.join(['motion,engine,max_rad,rms_rad,torque', *lines, ''])
 
 
-def _table(comparisons: list[Comparison], rules: dict[str, str]) -> str:
-    width = max(len(comparison.trial.name) for comparison in comparisons)
+def _table(comparisons: list[EngineComparison], sampling: dict[str, str]) -> str:
+    width = max(len(comparison.motion.name) for comparison in comparisons)
     lines = [f'{"link angles, ours minus theirs":<{width + 21}}  {"max [rad]":>10} '
              f'{"rms [rad]":>10}']
-    lines += [f'{trial:<{width}}  {engine:<19}  {largest:>10.2e} {rms:>10.2e}'
-              for trial, engine, largest, rms in _rows(comparisons, rules)]
+    lines += [f'{motion:<{width}}  {engine:<19}  {largest:>10.2e} {rms:>10.2e}'
+              for motion, engine, largest, rms in _rows(comparisons, sampling)]
     lines += ['', 'torques and prescribed wheel angles']
-    lines += [f'{name:<19}  {rule}' for name, rule in {'ours': OURS, **rules}.items()]
+    lines += [f'{name:<19}  {rule}' for name, rule in {'ours': OURS, **sampling}.items()]
     return '\n'.join([*lines, ''])
 
 
-def _data(comparisons: list[Comparison], rules: dict[str, str]) -> dict[str, Any]:
+def _data(comparisons: list[EngineComparison], sampling: dict[str, str]) -> dict[str, Any]:
     differences: dict[str, dict[str, Any]] = {}
-    for trial, engine, largest, rms in _rows(comparisons, rules):
-        differences.setdefault(trial, {})[engine] = {'max_rad': largest, 'rms_rad': rms}
+    for motion, engine, largest, rms in _rows(comparisons, sampling):
+        differences.setdefault(motion, {})[engine] = {'max_rad': largest, 'rms_rad': rms}
     return {
         'step_s': STEP,
         'paper_tests': {
             'wheel_amplitude_rad': AMPLITUDE, 'frequency_hz': FREQUENCY_HZ,
             'start_rad': START.tolist(),
             'swing_rad': {
-                comparison.trial.name: np.ptp(comparison.ours.link_angles, axis=0).tolist()
-                for comparison in comparisons if comparison.trial.name in PAPER_TESTS}},
-        'torque_sampling': {'ours': OURS, **rules},
+                comparison.motion.name: np.ptp(comparison.ours.link_angles, axis=0).tolist()
+                for comparison in comparisons if comparison.motion.name in PAPER_TESTS}},
+        'torque_sampling': {'ours': OURS, **sampling},
         'differences': differences,
     }

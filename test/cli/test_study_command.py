@@ -40,10 +40,10 @@ def result(value: float) -> Result:
                   {'sum.csv': 'sum\n', 'sum.png': b'\x89PNG'}, ['no second line: no ink'])
 
 
-def test_validation_keeps_its_checks_and_writes_what_it_found(
+def test_validation_passes_its_checks_and_writes_its_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Once from end to end; one reference motion is enough for that."""
+    """From end to end, with one reference motion."""
     for library in ('sympy', 'mujoco', 'matplotlib'):
         pytest.importorskip(library)
     monkeypatch.setattr(validation, 'REFERENCES', ('asymmetric',))
@@ -53,7 +53,7 @@ def test_validation_keeps_its_checks_and_writes_what_it_found(
     folder = tmp_path / 'study_validation'
     assert sorted(path.name for path in folder.iterdir()) == [
         'validation.csv', 'validation.json', 'validation.png']
-    # Whoever comes first compiles, which is announced.
+    # The first command compiles, which it announces.
     assert [line for line in err.splitlines() if not line.startswith('Compiling')] == []
     assert 'MISSED' not in out
 
@@ -80,7 +80,7 @@ def test_validation_keeps_its_checks_and_writes_what_it_found(
 def test_consistency_is_the_same_whatever_the_number_of_processes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Two kinds, three runs each of 0.6 s; too few for the limits, which is told as well."""
+    """Two kinds, three runs of 0.6 s each; too few for the limits, so that checks fail."""
     pytest.importorskip('matplotlib')
     kinds = [replace(case, scenario=replace(case.scenario, duration=0.6))
              for case in consistency.cases() if case.name in ('matched', 'prototype')]
@@ -122,7 +122,7 @@ def test_a_missed_check_is_exit_code_1(
     assert [check['passed'] for check in document['checks']] == [code == 0]
 
 
-def test_files_go_where_they_are_asked_to(
+def test_files_are_written_to_the_given_places(
     stub: Stub, tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
     stub(lambda progress: result(0.5))
@@ -145,11 +145,11 @@ def test_json_may_go_into_the_new_folder(stub: Stub, tmp_path: Path) -> None:
     assert (folder / 'a.json').read_bytes() == (folder / 'validation.json').read_bytes()
 
 
-def test_places_that_are_not_writable_are_told_before_the_work(
+def test_places_that_are_not_writable_are_refused_before_the_work(
     stub: Stub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Whoever runs the tests may be allowed everything, so that is asked elsewhere."""
+    """The user of the tests may be root, so that `os.access` is replaced."""
     def fail(progress: Progress) -> Result:
         raise AssertionError('it began to work')
 
@@ -160,9 +160,10 @@ def test_places_that_are_not_writable_are_told_before_the_work(
     assert main(['study', 'validation', '-o', str(locked)]) == 2
     assert main(['study', 'validation', '-o', str(tmp_path / 'out'), '--json',
                  str(locked / 'v.json')]) == 2
-    assert capsys.readouterr().err.splitlines() == [
-        f'fourbar study: cannot write into {locked}: it is not writable',
-        f'fourbar study: cannot write {locked / "v.json"}: {locked} is not writable']
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert str(locked) in lines[0]
+    assert str(locked / 'v.json') in lines[1]
     assert list(tmp_path.iterdir()) == [locked]
 
 
@@ -194,23 +195,22 @@ def test_progress_does_not_change_what_it_shows(stub: Stub, tmp_path: Path) -> N
     assert seen == ['a', 'b']
 
 
-@pytest.mark.parametrize(('arguments', 'complaint'), [
-    (['atlantis'], f"no study 'atlantis' (known are {', '.join(studies.STUDIES)})"),
-    (['consistency', '--runs', '0'], '--runs must be from 1 to 1000000, got 0'),
-    (['consistency', '--jobs', '0'], '--jobs must be from 1 to 1024, got 0'),
-    (['consistency', '--seed', '-1'], '--seed must be from 0 to'),
-    (['validation', '--runs', '5', '--seed', '1'],
-     'study validation takes no --runs, --seed'),
-    (['validation', '-o', 'file/folder'], 'cannot make file/folder'),
-    (['validation', '--json', 'nowhere/v.json'], 'cannot write nowhere/v.json: no such folder'),
-    (['validation', '--json', '.'], 'cannot write .: it is not a regular file'),
-    (['validation', '--json', '/dev/null'], 'cannot write /dev/null: it is not a regular file'),
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (['atlantis'], ["'atlantis'", *studies.STUDIES]),
+    (['consistency', '--runs', '0'], ['--runs', '1', '1000000', '0']),
+    (['consistency', '--jobs', '0'], ['--jobs', '1', '1024', '0']),
+    (['consistency', '--seed', '-1'], ['--seed', '0', '-1']),
+    (['validation', '--runs', '5', '--seed', '1'], ['validation', '--runs', '--seed']),
+    (['validation', '-o', 'file/folder'], ['file/folder']),
+    (['validation', '--json', 'nowhere/v.json'], ['nowhere/v.json']),
+    (['validation', '--json', '.'], ['.']),
+    (['validation', '--json', '/dev/null'], ['/dev/null']),
 ])
 def test_bad_input_is_one_line_and_exit_code_2(
-    arguments: list[str], complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str], words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str], stub: Stub,
 ) -> None:
-    """And it is found before the work, not after it."""
+    """The error is found before the work."""
     def fail(progress: Progress) -> Result:
         raise AssertionError('it began to work')
 
@@ -220,8 +220,9 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert main(['study', *arguments]) == 2
     out, err = capsys.readouterr()
     assert out == ''
-    assert err.startswith(f'fourbar study: {complaint}')
+    assert err.startswith('fourbar study: ')
     assert len(err.splitlines()) == 1
+    assert all(word in err for word in words)
     assert [path.name for path in tmp_path.iterdir()] == ['file']
 
 
@@ -229,7 +230,7 @@ def test_study_that_refuses_leaves_no_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(['study', 'montecarlo', 'atlantis', '-o', str(tmp_path / 'deep' / 'folder')]) == 2
-    assert capsys.readouterr().err.startswith("fourbar study: no campaign 'atlantis'")
+    assert "'atlantis'" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

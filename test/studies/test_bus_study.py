@@ -10,11 +10,11 @@ pytestmark = pytest.mark.node
 
 
 def test_nothing_is_lost_in_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever it takes: how long that is depends on the machine, and is what the study tells."""
+    """The round trips depend on the machine and have no limit here."""
     monkeypatch.setattr(bus, 'ANSWER_TIMEOUT_S', 5.0)
     result = bus.run(lambda items, _: items, seconds=2)
     assert result.data['ticks'] == 500
-    # Heartbeats and clocks come beside twelve frames a tick; a sample in a hundred is left out.
+    # Twelve frames a tick, and heartbeats and clocks; one sample in a hundred is lost.
     assert result.data['frames_received'] > 0.97 * 12 * 500
     assert result.data['frames_sent'] == 5 * 500 + 1
     for kind in ('lost_angles', 'lost_heartbeats', 'replayed', 'wrong_time',

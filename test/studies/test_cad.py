@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Defects of a CAD model: momentum by hand, Kane's method, and what fits the paper's words."""
+"""Defects of a CAD model: momentum by hand, Kane's method, and the fits to the paper."""
 
 import csv
 from io import BytesIO, StringIO
@@ -10,20 +10,18 @@ import json
 from fourbar_ros.mechanism import angular_momentum, assemble, load_mechanism
 from fourbar_ros.mechanism.case import Case
 from fourbar_ros.studies import cad, load_study, Result
-from fourbar_ros.studies.cad import (
-    curve,
-    explain_by_two,
-    moved,
+from fourbar_ros.studies.cad import fit_two, fit_wheel_counted_twice, size_curve, size_for
+from fourbar_ros.studies.cad_defects import (
+    defective,
+    DEFECTS,
+    Effects,
+    effects_of,
     RMS,
     rms,
-    size_for,
+    simulate_test,
     THETA,
     TIMES,
-    wheel_counted_twice,
-    Words,
-    words,
 )
-from fourbar_ros.studies.cad_defects import defective, DEFECTS
 import numpy as np
 import pytest
 
@@ -54,29 +52,29 @@ def test_uncoupled_pairs_by_hand(name: str, changed: float, moves_bd: bool) -> N
     assert rms({name: 0.03}, 0, AMPLITUDE) == pytest.approx(pair, rel=1e-6)
     assert rms({name: 0.03}, 1, AMPLITUDE) == pytest.approx(
         pair * np.sqrt(2.0 if moves_bd else 1.0), rel=1e-6)
-    # Links b and d stay at rest: this is not what the paper saw.
-    assert words({name: 0.03}, AMPLITUDE).turned < 1e-9
+    # Links b and d stay at rest, unlike in the paper.
+    assert effects_of({name: 0.03}, AMPLITUDE).resting_turn < 1e-9
 
 
 def test_any_defect_keeps_momentum() -> None:
-    """Of links, and of wheels that turn with them: wheels turn as told, and all is at rest."""
+    """Links and wheels start at rest, and the total stays zero."""
     for name in DEFECTS:
         mechanism = defective({name: 0.3 * DEFECTS[name].largest})
         for test in (0, 1):
-            angles = moved(mechanism, test, AMPLITUDE)
+            angles = simulate_test(mechanism, test, AMPLITUDE)
             rates = np.gradient(angles, TIMES, axis=0, edge_order=2)
-            told = -AMPLITUDE * 0.2 * np.pi * np.sin(0.2 * np.pi * TIMES)
+            driving = -AMPLITUDE * 0.2 * np.pi * np.sin(0.2 * np.pi * TIMES)
             driven = np.array([[1.0, 0.0, 1.0, 0.0], [1.0, 1.0, 1.0, 1.0]])[test]
             middle = slice(10, -10, 10)
             momenta = [angular_momentum(mechanism, *state) for state in zip(
-                angles[middle], rates[middle], rates[middle] + np.outer(told, driven)[middle])]
-            # What differences of angles a tenth of a second apart are good for.
-            limit = 0.01 * 3.4e-7 * driven.sum() * np.abs(told).max()
+                angles[middle], rates[middle], rates[middle] + np.outer(driving, driven)[middle])]
+            # Accuracy of differences of angles a tenth of a second apart.
+            limit = 0.01 * 3.4e-7 * driven.sum() * np.abs(driving).max()
             assert float(np.abs(momenta).max()) < limit, name
 
 
 def test_offset_along_the_link_does_what_one_across_does() -> None:
-    """What couples the pairs is the square of the distance, docs/studies.md."""
+    """The square of the distance couples the pairs, docs/studies/cad.md."""
     for size in (0.003, 0.01):
         for test in (0, 1):
             assert rms({'offset_x_same': size}, test, AMPLITUDE) == pytest.approx(
@@ -93,12 +91,12 @@ def test_sign_of_even_defects_changes_nothing(name: str) -> None:
 def test_no_defect_is_no_difference() -> None:
     for test in (0, 1):
         assert rms({}, test, AMPLITUDE) == 0.0
-    found = words({}, AMPLITUDE)
-    assert found.turned < 1e-9
-    assert found.swing == 0.0
-    assert found.changed < 1e-9
-    assert Words(0.1, -0.01, 0.1).kept == (True, True, True)
-    assert Words(0.001, 0.01, 0.001).kept == (False, False, False)
+    effects = effects_of({}, AMPLITUDE)
+    assert effects.resting_turn < 1e-9
+    assert effects.swing == 0.0
+    assert effects.configuration < 1e-9
+    assert Effects(0.1, -0.01, 0.1).as_stated == (True, True, True)
+    assert Effects(0.001, 0.01, 0.001).as_stated == (False, False, False)
 
 
 @pytest.mark.parametrize(('name', 'sign', 'test'), [
@@ -117,26 +115,26 @@ def test_what_has_no_effect_has_no_size() -> None:
 
 
 @pytest.fixture(scope='module')
-def explained():
-    """Return the explanations that the study checks, found anew over a few amplitudes."""
+def fitted():
+    """Return the fits that the study checks, computed with few amplitudes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cad, 'AMPLITUDES', np.array([40.0, 60.0]))
-        best, = curve('offset_y_same', 1.0).found
-    return best, wheel_counted_twice()
+        best, = size_curve('offset_y_same', 1.0).fits
+    return best, fit_wheel_counted_twice()
 
 
-def test_explanations_fit_both_numbers_and_all_words(explained) -> None:
-    best, twice = explained
+def test_fits_reproduce_both_numbers_and_all_statements(fitted) -> None:
+    best, twice = fitted
     assert best.sizes['offset_y_same'] == pytest.approx(7.40e-3, abs=5e-6)
     assert best.amplitude == pytest.approx(48.23, abs=5e-3)
     assert twice.sizes['inertia_all'] == pytest.approx(3.4e-7 / 2.2e-5)
     assert twice.sizes['offset_y_inside'] == pytest.approx(0.494e-3, abs=1e-6)
-    for each in explained:
+    for each in fitted:
         assert np.abs(each.residuals).max() < 1e-9
-        assert each.words.kept == (True, True, True)
+        assert each.effects.as_stated == (True, True, True)
 
 
-def test_kanes_method_comes_to_the_same_numbers(explained) -> None:
+def test_kanes_method_comes_to_the_same_numbers(fitted) -> None:
     """Nominal and defective linkage by SymPy along the chain, integrated by SciPy."""
     pytest.importorskip('sympy')
     from fourbar_ros.studies.independent import kane
@@ -148,44 +146,43 @@ def test_kanes_method_comes_to_the_same_numbers(explained) -> None:
             mechanism, assemble(mechanism, 0.0, THETA), rest, rest, amplitude * shape,
             np.full(4, 0.1), rest, TIMES, np.ones(4, dtype=bool))).link_angles
 
-    for each in explained:
+    for each in fitted:
         for test in (0, 1):
-            apart = (angles(defective(each.sizes), test, each.amplitude)
+            difference = (angles(defective(each.sizes), test, each.amplitude)
                      - angles(PAPER, test, each.amplitude))
-            found = float(np.degrees(np.sqrt((apart ** 2).mean())))
+            found = float(np.degrees(np.sqrt((difference ** 2).mean())))
             assert found == pytest.approx(RMS[test], abs=1e-7)
 
 
 def test_two_defects_leave_the_amplitude_open(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cad, 'PAIR_AMPLITUDES', np.array([20.0, 80.0]))
-    found = explain_by_two(('inertia_all', 'offset_y_inside'))
+    found = fit_two(('inertia_all', 'offset_y_inside'))
     assert [each.amplitude for each in found] == [20.0, 80.0]
     for each in found:
         assert np.abs(each.residuals).max() < cad.SOLVED
-        assert each.words.kept == (True, True, True)
+        assert each.effects.as_stated == (True, True, True)
 
 
 @pytest.fixture(scope='module')
 def result() -> Result:
-    """Return what the study finds with few amplitudes."""
-    figure = pytest.importorskip('fourbar_ros.studies.cad_figure')
+    """Run the study with few amplitudes."""
+    pytest.importorskip('matplotlib')
     with pytest.MonkeyPatch.context() as patch:
-        for module in (cad, figure):
-            patch.setattr(module, 'AMPLITUDES', np.array([10.0, 40.0, 60.0, 100.0]))
+        patch.setattr(cad, 'AMPLITUDES', np.array([10.0, 40.0, 60.0, 100.0]))
         patch.setattr(cad, 'PAIR_AMPLITUDES', np.array([50.0]))
         patch.setattr(cad, 'START_THETAS', (60.0, 90.0))
         return load_study('cad')(lambda items, count: items)
 
 
-def test_study_keeps_its_checks_and_tells_what_is_not_possible(result: Result) -> None:
+def test_study_passes_its_checks_and_rules_out_defects(result: Result) -> None:
     assert [check.name for check in result.checks if not check.passed] == []
     assert len({check.name for check in result.checks}) == len(result.checks)
     document = json.loads(json.dumps(result.data, allow_nan=False))
     assert document['best']['words_configuration_changes']
-    explained = {name for name, each in document['single'].items() if each['explanations']}
-    assert {'offset_y_same', 'offset_x_same'} <= explained
+    reproduced = {name for name, each in document['single'].items() if each['explanations']}
+    assert {'offset_y_same', 'offset_x_same'} <= reproduced
     assert not any(name.startswith(('inertia', 'wheel', 'mass', 'offset_y_inside'))
-                   for name in explained)
+                   for name in reproduced)
     assert document['single']['inertia_all_more']['largest_ratio'] == pytest.approx(
         np.sqrt(0.5), rel=1e-6)
     assert document['best_by_start_theta_deg']['90'] is None
@@ -194,7 +191,7 @@ def test_study_keeps_its_checks_and_tells_what_is_not_possible(result: Result) -
     assert max(document['rms_of_largest_offset_deg']) < np.degrees(0.1)
 
 
-def test_tables_hold_what_was_found(result: Result) -> None:
+def test_tables_contain_the_results(result: Result) -> None:
     rows = list(csv.DictReader(StringIO(str(result.files['cad.csv']))))
     assert len(rows) == 4 * len(result.data['single'])
     for row in rows:

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Paper Fig. 6: condition numbers by hand, which offsets matter, and what a reader gets."""
+"""Paper Fig. 6: condition numbers by hand, spans of offsets, and the output of the study."""
 
 import csv
 from io import BytesIO, StringIO
@@ -9,12 +9,10 @@ import json
 
 from fourbar_ros.common.config_files import ConfigurationError
 from fourbar_ros.studies import load_study, Result
-from fourbar_ros.studies.conditioning import (
-    ALL_SIGNS,
+from fourbar_ros.studies.conditioning import ALL_SIGNS, OF_OFFSET, OF_RATIO
+from fourbar_ros.studies.conditioning_linkages import (
     condition,
     LENGTH,
-    OF_OFFSET,
-    OF_RATIO,
     parallelogram,
     rhombus,
     SIGNS,
@@ -57,8 +55,8 @@ def test_parallelogram_by_hand(ratio: float) -> None:
 def test_offsets_by_hand(signs: tuple[float, ...]) -> None:
     for theta in (0.1, 0.3, 1.0, np.pi / 2.0, 2.5):
         for offset in (-0.04, -0.01, 0.02, 0.06):
-            wanted = by_hand(tuple(offset * sign for sign in signs), theta)
-            assert condition(rhombus(signs, offset), theta) == pytest.approx(wanted, rel=1e-9)
+            expected = by_hand(tuple(offset * sign for sign in signs), theta)
+            assert condition(rhombus(signs, offset), theta) == pytest.approx(expected, rel=1e-9)
 
 
 def test_known_values() -> None:
@@ -70,13 +68,13 @@ def test_known_values() -> None:
         assert condition(mechanism, np.pi / 2.0) == pytest.approx(square, abs=5e-5)
 
 
-def test_a_and_c_inwards_with_b_and_d_outwards_cost_nothing() -> None:
+def test_offsets_of_a_and_c_inwards_and_b_and_d_outwards_leave_cond_at_1() -> None:
     for theta in (0.1, 0.7, 2.0):
         assert condition(rhombus((1.0, 1.0, -1.0, -1.0), 0.04), theta) == pytest.approx(1.0)
 
 
-def test_unequal_offsets_tell_one_side_from_the_other() -> None:
-    """That no convention does lies in equal offsets, not in the model."""
+def test_cond_depends_on_the_sign_of_unequal_offsets() -> None:
+    """For equal offsets it does not, in any convention."""
     unequal = (1.0, 0.3, 0.5, 0.2)
     assert condition(rhombus(unequal, 0.04), 0.3) != pytest.approx(
         condition(rhombus(unequal, -0.04), 0.3), rel=1e-3)
@@ -94,19 +92,19 @@ def test_span_ends_where_condition_reaches_its_limit(name: str) -> None:
 
 
 def studied(mechanism: str | None = None) -> Result:
-    given = {} if mechanism is None else {'mechanism': mechanism}
-    return load_study('conditioning', **given)(lambda items, count: items)
+    options = {} if mechanism is None else {'mechanism': mechanism}
+    return load_study('conditioning', **options)(lambda items, count: items)
 
 
 @pytest.fixture(scope='module')
 def result() -> Result:
-    """Return what the study finds, a prototype looked at as well."""
+    """Run the study with the prototype as a further linkage."""
     return studied('prototype')
 
 
-def test_checks_are_kept(result: Result) -> None:
-    """All but the time, which is that of the machine."""
-    assert [check.name for check in result.checks if not check.passed and check.unit != 's'] == []
+def test_checks_pass(result: Result) -> None:
+    assert [check.name for check in result.checks if not check.passed] == []
+    # The time depends on the machine; `bench` has a limit for it.
     assert 0.0 < result.data['grid_seconds']
 
 
@@ -127,8 +125,8 @@ def test_grids_are_written_and_symmetric(result: Result) -> None:
                 THETAS[99]), rel=1e-5)
 
 
-def test_near_a_change_point_a_and_b_lose_what_four_wheels_keep(result: Result) -> None:
-    """cond(A) of equal links knows nothing of it."""
+def test_near_a_change_point_four_wheels_keep_the_gain_that_a_and_b_lose(result: Result) -> None:
+    """cond(A) of equal links does not indicate it."""
     rows = list(csv.DictReader(StringIO(str(result.files['conditioning_hidden.csv']))))
     equal = [row for row in rows if row['linkage'] == 'equal links']
     longer = [row for row in rows if row['linkage'] != 'equal links']
@@ -140,7 +138,7 @@ def test_near_a_change_point_a_and_b_lose_what_four_wheels_keep(result: Result) 
     assert min(float(row['closure_ratio']) for row in longer) > 0.05
 
 
-def test_linkage_of_a_file_is_looked_at_on_both_branches(result: Result) -> None:
+def test_further_linkage_is_evaluated_on_both_branches(result: Result) -> None:
     rows = list(csv.DictReader(StringIO(str(result.files['conditioning_linkage.csv']))))
     assert {row['branch'] for row in rows} == {'open', 'crossed'}
     document = json.loads(json.dumps(result.data, allow_nan=False))

@@ -13,7 +13,6 @@ from fourbar_ros.mechanism.state import LINK_ANGLES, make_state
 from fourbar_ros.plant import load_table
 from fourbar_ros.plant.table import surroundings_of
 from fourbar_ros.studies import design
-from fourbar_ros.studies.actuation_cost import actuation_cost, rest_to_rest
 from fourbar_ros.studies.design_model import (
     Design,
     evaluate,
@@ -21,6 +20,7 @@ from fourbar_ros.studies.design_model import (
     with_ratio,
     with_wheels,
 )
+from fourbar_ros.studies.planned_cost import actuation_cost, rest_to_rest
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid

@@ -16,12 +16,12 @@ from fourbar_ros.mechanism import (
     Mechanism,
     reduced_form,
 )
-from fourbar_ros.studies.actuation_cost import (
+from fourbar_ros.studies.energy import balancing, integration_error, run, turn
+from fourbar_ros.studies.planned_cost import (
     actuation_cost,
     ActuationCostError,
     rest_to_rest,
 )
-from fourbar_ros.studies.energy import balancing, integration_error, run, turn
 import numpy as np
 import pytest
 

@@ -32,8 +32,6 @@ from fourbar_ros.studies.independent.mujoco_model import (
 import numpy as np
 import pytest
 
-pytest.importorskip('mujoco')
-
 CASES = sorted((Path(__file__).parents[2] / 'config' / 'reference').glob('*.json'))
 STEP = 1e-3
 QUANTITIES = ('link_angles', 'link_rates', 'flywheel_speeds_absolute')
@@ -41,8 +39,14 @@ QUANTITIES = ('link_angles', 'link_rates', 'flywheel_speeds_absolute')
 each_case = pytest.mark.parametrize('path', CASES, ids=lambda path: path.stem)
 
 
+@pytest.fixture(autouse=True)
+def mujoco() -> None:
+    """Skip the test where MuJoCo is not installed."""
+    pytest.importorskip('mujoco')
+
+
 class Reference:
-    """A motion that was worked out elsewhere."""
+    """A reference motion from a file."""
 
     def __init__(self, path: Path) -> None:
         values: dict[str, Any] = json.loads(path.read_text())
@@ -88,7 +92,7 @@ def reference_named(name: str) -> Reference:
     return Reference(next(path for path in CASES if path.stem == name))
 
 
-def test_state_comes_out_as_it_went_in(uneven: Mechanism) -> None:
+def test_state_is_returned_as_it_was_set(uneven: Mechanism) -> None:
     rng = np.random.default_rng(1)
     linkage = MujocoLinkage(uneven)
     for _ in range(20):
@@ -102,7 +106,7 @@ def test_state_comes_out_as_it_went_in(uneven: Mechanism) -> None:
 
 
 def test_momentum_and_energy_are_those_of_the_mechanism(uneven: Mechanism) -> None:
-    """Every mass, inertia, length and offset is in its place."""
+    """Masses, inertias, lengths and offsets of the model are right."""
     import mujoco
 
     rng = np.random.default_rng(2)
@@ -121,10 +125,10 @@ def test_momentum_and_energy_are_those_of_the_mechanism(uneven: Mechanism) -> No
 
 
 @each_case
-def test_stiff_closure_leaves_what_the_held_torque_leaves(path: Path) -> None:
+def test_stiff_closure_has_the_error_of_the_held_torque(path: Path) -> None:
     reference = Reference(path)
     state = reference.move(stiff('RK4', STEP), reference.times[-1])
-    # A hundredth more for the joint that gives, and 1e-12 for the digits of the file.
+    # A hundredth more for the compliant joint, and 1e-12 for the digits of the file.
     share = 1.01 * (reference.omega.max() * STEP) ** 2 / 24.0
     for name in QUANTITIES:
         most = np.abs(reference.expected[name]).max()
@@ -134,7 +138,7 @@ def test_stiff_closure_leaves_what_the_held_torque_leaves(path: Path) -> None:
 
 
 @each_case
-def test_euler_is_behind_by_half_a_step(path: Path) -> None:
+def test_error_of_euler_is_half_a_step(path: Path) -> None:
     reference = Reference(path)
     state = reference.move(stiff('Euler', STEP), 4.0)
     travelled = np.abs(reference.expected['link_rates'][:81]).max()
@@ -142,7 +146,7 @@ def test_euler_is_behind_by_half_a_step(path: Path) -> None:
 
 
 @each_case
-def test_default_closure_gives(path: Path) -> None:
+def test_default_closure_is_compliant(path: Path) -> None:
     """MuJoCo's defaults close the loop in 20 ms: good for 1e-4 rad and not for 1e-8 rad."""
     reference = Reference(path)
     soft = reference.error(reference.move(Settings('RK4', STEP), 4.0))
@@ -162,7 +166,7 @@ def test_error_shrinks_with_the_step(integrator: str, order: int) -> None:
 @pytest.mark.parametrize('sampled', [0.0, 0.5])
 @pytest.mark.parametrize('integrator', ['Euler', 'RK4'])
 def test_torque_is_held_from_where_it_is_sampled(integrator: str, sampled: float) -> None:
-    """A wheel gathers exactly the torques that it was given, whatever the links do."""
+    """The momentum of a wheel is the sum of its torques, whatever the motion of the links."""
     reference = reference_named('asymmetric')
     state = reference.move(stiff(integrator, STEP), 0.5, sampled)
     moments = (np.arange(500) + sampled) * STEP
@@ -244,29 +248,31 @@ def test_lean_step_is_the_same_step() -> None:
         reference.move(settings, 0.5).link_angles, rtol=0.0, atol=1e-14)
 
 
-@pytest.mark.parametrize(('make', 'complaint'), [
-    (lambda: Settings('Runge'), 'Runge.*Euler, RK4'),
-    (lambda: Settings('Euler', 0.0), 'timestep.*got 0'),
-    (lambda: stiff('Euler', float('nan')), 'timestep.*nan'),
+@pytest.mark.parametrize(('make', 'name', 'value'), [
+    (lambda: Settings('Runge'), 'integrator', 'Runge'),
+    (lambda: Settings('Euler', 0.0), 'timestep', 0.0),
+    (lambda: stiff('Euler', float('inf')), 'timestep', float('inf')),
+    (lambda: stiff('Euler', float('nan')), 'timestep', pytest.approx(float('nan'), nan_ok=True)),
 ])
-def test_impossible_settings(make: Callable[[], Settings], complaint: str) -> None:
-    with pytest.raises(MujocoError, match=complaint):
+def test_impossible_settings(make: Callable[[], Settings], name: str, value: Any, refuses: Any
+                             ) -> None:
+    with refuses(MujocoError, name=name, value=value):
         make()
 
 
 @pytest.mark.parametrize('times', [[0.0, 0.0015], [0.0, 0.0], [0.002, 0.001]])
-def test_times_between_the_steps(times: list[float], paper: Mechanism) -> None:
+def test_times_between_the_steps(times: list[float], paper: Mechanism, refuses: Any) -> None:
     state = state_of(paper, assemble(paper, 0.0, 1.0), np.zeros(4), np.zeros(4))
-    with pytest.raises(MujocoError, match='whole multiples of the step of 0.001 s'):
+    with refuses(MujocoError, name='times', limit=STEP):
         MujocoLinkage(paper, stiff('Euler', STEP)).move(
             state, np.array(times), lambda time: np.zeros(4))
 
 
-def test_motion_that_mujoco_gives_up(
-    paper: Mechanism, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+def test_motion_that_diverges(
+    paper: Mechanism, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refuses: Any,
 ) -> None:
-    monkeypatch.chdir(tmp_path)     # where MuJoCo puts its log
+    monkeypatch.chdir(tmp_path)     # MuJoCo writes its log there
     state = state_of(paper, assemble(paper, 0.0, 1.0), np.zeros(4), np.zeros(4))
-    with pytest.raises(MujocoError, match='gave up'):
+    with refuses(MujocoError, value=0.05):
         MujocoLinkage(paper, Settings('Euler', 0.05)).move(
             state, np.arange(20) * 0.05, lambda time: np.array([1e3, -1e3, 0.0, 0.0]))

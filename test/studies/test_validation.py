@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The validation study: the laws it checks by, what it lets pass, and what it goes without."""
+"""The validation study: its laws, its limits, and missing libraries."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -12,30 +12,34 @@ from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.case import CaseError, simulate
 from fourbar_ros.studies import engine_comparison as comparison
 from fourbar_ros.studies import validation
-from fourbar_ros.studies.engine_comparison import Comparison, Trial
+from fourbar_ros.studies.engine_comparison import (
+    ComparedMotion,
+    EngineComparison,
+    IndependentEngine,
+)
 import numpy as np
 import pytest
 
 
 def no_progress(items: Iterable[Any], total: int) -> Iterable[Any]:
-    """Show nothing, but take all there is, and no more than was announced."""
+    """Return all items, and check their announced number."""
     found = list(items)
     assert len(found) == total
     return found
 
 
 @pytest.fixture(scope='module')
-def comparisons(paper: Mechanism) -> list[Comparison]:
+def comparisons(paper: Mechanism) -> list[EngineComparison]:
     """Run the paper's tests with ours alone, standing in for Kane's engine as well."""
     found = []
     for name, shape in validation.PAPER_TESTS.items():
-        trial = Trial(name, validation.paper_test(paper, np.array(shape)))
-        ours = simulate(trial.case, comparison.STEP)
-        found.append(Comparison(trial, ours, {'kane': ours.link_angles}))
+        motion = ComparedMotion(name, validation.paper_test(paper, np.array(shape)))
+        ours = simulate(motion.case, comparison.STEP)
+        found.append(EngineComparison(motion, ours, {'kane': ours.link_angles}))
     return found
 
 
-def verdicts(comparisons: list[Comparison]) -> dict[str, bool]:
+def outcomes(comparisons: list[EngineComparison]) -> dict[str, bool]:
     return {check.name: check.passed for check in validation.checks(comparisons)}
 
 
@@ -59,11 +63,11 @@ def test_the_turn_by_hand_balances_the_wheels(paper: Mechanism) -> None:
     assert np.ptp(turn) == pytest.approx(0.94, abs=1e-3)
 
 
-def test_all_checks_pass(comparisons: list[Comparison]) -> None:
-    assert all(verdicts(comparisons).values())
+def test_all_checks_pass(comparisons: list[EngineComparison]) -> None:
+    assert all(outcomes(comparisons).values())
 
 
-@pytest.mark.parametrize(('trial', 'links', 'missed'), [
+@pytest.mark.parametrize(('name', 'links', 'missed'), [
     ('paper_test_1', [0, 2], {'test 1, a and c beside momentum by hand'}),
     ('paper_test_1', [1, 3], {'test 1, turn of b and d'}),
     ('paper_test_2', [0, 1, 2, 3], {'test 2, all links beside momentum by hand'}),
@@ -71,21 +75,21 @@ def test_all_checks_pass(comparisons: list[Comparison]) -> None:
                               'test 2, change of configuration'}),
     ('paper_opposite', [3], {'opposite commands, turn of any link'}),
 ])
-def test_a_motion_that_is_off_is_missed(
-    trial: str, links: list[int], missed: set[str], comparisons: list[Comparison],
+def test_wrong_motion_fails_its_check(
+    name: str, links: list[int], missed: set[str], comparisons: list[EngineComparison],
 ) -> None:
     """Two nanoradians at one time, where a nanoradian is the limit; no joint opens by 1e-12 m."""
-    def off(one: Comparison) -> Comparison:
+    def off(one: EngineComparison) -> EngineComparison:
         angles = one.ours.link_angles.copy()
         angles[100, links] += 2e-9
         return replace(one, ours=replace(one.ours, link_angles=angles))
 
-    changed = [off(one) if one.trial.name == trial else one for one in comparisons]
-    failed = {name for name, passed in verdicts(changed).items() if not passed}
+    changed = [off(one) if one.motion.name == name else one for one in comparisons]
+    failed = {name for name, passed in outcomes(changed).items() if not passed}
     assert failed - {'closure, widest gap'} == missed | {'kane, largest difference'}
 
 
-def test_momentum_from_nowhere_is_missed(comparisons: list[Comparison]) -> None:
+def test_change_of_momentum_is_detected(comparisons: list[EngineComparison]) -> None:
     one = comparisons[1]
     speeds = one.ours.flywheel_speeds_absolute.copy()
     speeds[50] *= 1.0 + 1e-8
@@ -94,7 +98,7 @@ def test_momentum_from_nowhere_is_missed(comparisons: list[Comparison]) -> None:
     assert validation.momentum_drift(changed[0]) > 1e-9
 
 
-def test_differences_are_over_all_links_and_times(comparisons: list[Comparison]) -> None:
+def test_differences_are_over_all_links_and_times(comparisons: list[EngineComparison]) -> None:
     one = comparisons[0]
     angles = one.ours.link_angles.copy()
     angles[7, 2] -= 3e-6
@@ -104,40 +108,40 @@ def test_differences_are_over_all_links_and_times(comparisons: list[Comparison])
     assert other.rms('kane') == pytest.approx(5e-6 / np.sqrt(angles.size))
 
 
-def test_step_of_mujoco_is_taken_out_of_its_motion(
-    comparisons: list[Comparison], monkeypatch: pytest.MonkeyPatch,
+def test_extrapolation_removes_the_second_order_error_of_mujoco(
+    comparisons: list[EngineComparison], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An engine that is off by the square of its step is exact when extrapolated."""
-    def engine(step: float) -> comparison.Engine:
-        return comparison.Engine('', lambda trial: (
-            simulate(trial.case, comparison.STEP).link_angles + step**2))
+    """An engine with an error of the square of its step is exact when extrapolated."""
+    def engine(step: float) -> IndependentEngine:
+        return IndependentEngine('', lambda motion: (
+            simulate(motion.case, comparison.STEP).link_angles + step**2))
 
     engines = {name: engine(step) for name, step in comparison.MUJOCO_STEPS.items()}
-    monkeypatch.setattr(comparison, 'engines', lambda: (engines, []))
-    trials = [one.trial for one in comparisons]
-    compared, rules, _ = comparison.compare(trials, no_progress)
-    assert list(rules) == [*engines, 'mujoco_extrapolated']
+    monkeypatch.setattr(comparison, 'available_engines', lambda: (engines, []))
+    motions = [one.motion for one in comparisons]
+    compared, sampling, _ = comparison.compare(motions, no_progress)
+    assert list(sampling) == [*engines, 'mujoco_extrapolated']
     for one in compared:
         assert one.largest('mujoco_1ms') == pytest.approx(1e-6)
         assert one.largest('mujoco_extrapolated') < 1e-14
 
 
-@pytest.mark.parametrize(('library', 'engines', 'told'), [
+@pytest.mark.parametrize(('library', 'engines', 'name'), [
     ('sympy', {'reference', 'mujoco_1ms', 'mujoco_2ms'}, 'Kane'),
     ('mujoco', {'reference', 'kane'}, 'MuJoCo'),
 ])
-def test_engines_that_are_not_installed_are_told(
-    library: str, engines: set[str], told: str, monkeypatch: pytest.MonkeyPatch,
+def test_engines_that_are_not_installed_are_reported(
+    library: str, engines: set[str], name: str, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name in ('sympy', 'mujoco'):
-        pytest.importorskip(name)
+    for module in ('sympy', 'mujoco'):
+        pytest.importorskip(module)
     monkeypatch.setitem(sys.modules, library, None)
-    found, skipped = comparison.engines()
+    found, skipped = comparison.available_engines()
     assert set(found) == engines
-    assert [told in line and f'{library} is missing' in line for line in skipped] == [True]
+    assert [name in line and f'{library} is missing' in line for line in skipped] == [True]
 
 
-def test_goes_on_without_any_library(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_without_any_optional_library(monkeypatch: pytest.MonkeyPatch) -> None:
     for library in ('sympy', 'mujoco', 'matplotlib'):
         monkeypatch.setitem(sys.modules, library, None)
     monkeypatch.delitem(
@@ -151,7 +155,8 @@ def test_goes_on_without_any_library(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 'kane' not in result.text
 
 
-def test_missing_reference_motion_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_reference_motion_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(validation, 'REFERENCES', ('atlantis',))
-    with pytest.raises(CaseError, match='atlantis'):
-        validation.trials()
+    with pytest.raises(CaseError) as caught:
+        validation.motions()
+    assert 'atlantis.json' in str(caught.value)

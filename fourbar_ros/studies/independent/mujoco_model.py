@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The linkage as a MuJoCo model: a tree of four links, closed at joint 3 by an equality constraint.
+The linkage as a MuJoCo model: a tree of four links with an equality constraint at joint 3.
 
 In the plane (two slides and a hinge for link a), without gravity, contact or friction: b turns on
-a at joint 1, c on b at joint 2, d on a at joint 4, and `equality/connect` pulls the far ends of c
-and d together. MuJoCo's constraints are soft by design (section "Constraint model" of its
-documentation): joint 3 gives a little, so that a motion comes out only as exact as `solref`,
-`solimp` and the step let it. The torques are held over each step.
+a at joint 1, c on b at joint 2, d on a at joint 4, and `equality/connect` joins the far ends of c
+and d. MuJoCo's constraints are soft by design (section "Constraint model" of its documentation):
+joint 3 is compliant, and `solref`, `solimp` and the step limit the accuracy of a motion. Torques
+are held over each step.
 
 Needs MuJoCo 3.4 or later; importing this module does not.
 """
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 INTEGRATORS = ('Euler', 'RK4')
 LETTERS = 'abcd'
 
-# A wheel needs a mass of its own to be a body; the link's is less by as much.
+# Share of a link's mass that its wheel has, because MuJoCo requires a mass for every body.
 WHEEL_SHARE = 1e-6
 
 # omega = ANGLES_OF_HINGES @ (rate of hinge a, b, c, d): b turns on a, c on b, d on a.
@@ -37,32 +37,32 @@ ANGLES_OF_HINGES = np.array([
     [1.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0], [1.0, 1.0, 1.0, 0.0], [1.0, 0.0, 0.0, 1.0]])
 HINGES_OF_ANGLES = np.linalg.inv(ANGLES_OF_HINGES)
 
-# Stages of MuJoCo's step that this model has no use for, see `Settings.lean`.
-NEEDLESS = ('contact', 'island', 'warmstart', 'gravity', 'actuation', 'sensor', 'limit',
+# Stages of MuJoCo's step without effect in this model, see `Settings.lean`.
+UNUSED = ('contact', 'island', 'warmstart', 'gravity', 'actuation', 'sensor', 'limit',
             'frictionloss', 'spring', 'damper')
 
-# How far a time may be from a multiple of the step, in steps.
+# Tolerance of times as multiples of the step [steps].
 _ROUNDING = 1e-6
 
 
 class MujocoError(FourbarError):
-    """A setting that MuJoCo does not have, or a motion that it cannot do."""
+    """An unknown setting, or a motion that MuJoCo cannot simulate."""
 
 
 @dataclass(frozen=True)
 class Settings:
     """
-    How MuJoCo integrates and how hard it closes the loop, its own defaults but for the step.
+    Integrator and stiffness of the closure; MuJoCo's own defaults except for the step.
 
     :param integrator: `Euler` (semi-implicit) or `RK4`.
     :param timestep: [s].
     :param solref: time constant [s] and damping ratio of the spring that closes joint 3; MuJoCo
-        does not go below two steps.
-    :param solimp: impedance at no gap and at a wide one, what wide means [m], and the shape in
-        between; MuJoCo does not go above 0.9999.
+        limits the time constant to at least two steps.
+    :param solimp: impedance without gap and at a wide one, the width [m], and the shape in
+        between; MuJoCo limits the impedance to 0.9999.
     :param tolerance: of the constraint solver.
-    :param iterations: of the constraint solver, at most.
-    :param lean: leave out the stages that this model has no use for; the motion is the same.
+    :param iterations: largest number of iterations of the constraint solver.
+    :param lean: disable the stages without effect in this model; the motion is the same.
     :raises MujocoError: unknown integrator, or a step that is not positive.
     """
 
@@ -75,18 +75,19 @@ class Settings:
     lean: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what MuJoCo would refuse less clearly."""
+        """Check the settings, with clearer messages than MuJoCo's."""
         if self.integrator not in INTEGRATORS:
             raise MujocoError(
-                f'unknown integrator {self.integrator!r} (known are {", ".join(INTEGRATORS)})')
+                f'unknown integrator {self.integrator!r} (known are {", ".join(INTEGRATORS)})',
+                name='integrator', value=self.integrator, limit=INTEGRATORS)
         if not 0.0 < self.timestep < np.inf:
-            raise MujocoError(f'timestep must be a positive number of seconds, '
-                              f'got {self.timestep:g}')
+            raise MujocoError('timestep must be a positive number of seconds, '
+                              f'got {self.timestep:g}', name='timestep', value=self.timestep)
 
 
 def stiff(integrator: str, timestep: float) -> Settings:
     """
-    Return settings that close the loop as hard as does the motion good.
+    Return settings with the stiffest closure that improves the accuracy.
 
     MuJoCo would take a time constant of two steps, but then what each step's torque excites of
     the spring shows in the rates; at four it does not, and joint 3 is open by less than 1e-11 m.
@@ -151,10 +152,10 @@ class MujocoLinkage:
 
     def set_state(self, state: State) -> None:
         """
-        Begin anew in a state, at time 0, with no torque.
+        Set a state at time 0, without torque.
 
-        :param state: a single one; its angles should close the loop, MuJoCo pulls it closed
-            otherwise. What it says of a locked wheel is not used.
+        :param state: a single state. Its angles should close the loop, otherwise MuJoCo pulls it
+            closed. Its values for locked wheels are not used.
         """
         mujoco, model, data = self._mujoco, self.model, self.data
         free = ~self._locked
@@ -163,13 +164,13 @@ class MujocoLinkage:
         data.qvel[self._hinges] = HINGES_OF_ANGLES @ state.link_rates
         data.qpos[self._wheels] = state.flywheel_angles[free]
         data.qvel[self._wheels] = (state.flywheel_speeds_absolute - state.link_rates)[free]
-        # The slides carry joint 1: where that is follows from where the mass centre is.
+        # The slides carry joint 1, whose position follows from that of the mass centre.
         position, velocity = self._centre()
         data.qpos[self._slides] = state.centre_position - position
         data.qvel[self._slides] = state.centre_velocity - velocity
 
     def state(self) -> State:
-        """Return the present state."""
+        """Return the current state."""
         data = self.data
         rates = ANGLES_OF_HINGES @ data.qvel[self._hinges]
         wheel_angles = np.zeros(4)
@@ -181,20 +182,20 @@ class MujocoLinkage:
 
     def apply(self, torques: Array) -> None:
         """
-        Let the motors give torques until told otherwise.
+        Set the motor torques until the next call.
 
-        :param torques: (4,) on the wheels, the links feel the opposite [N m].
+        :param torques: (4,) on the wheels; the opposite acts on the links [N m].
         """
-        # A hinge drives all that hangs on it.
+        # A hinge drives the whole subtree.
         self.data.qfrc_applied[self._hinges] = -ANGLES_OF_HINGES.T @ (torques * self._locked)
         self.data.qfrc_applied[self._wheels] = torques[~self._locked]
 
     def advance(self, steps: int = 1) -> None:
-        """Go on by this many steps, the torques held."""
+        """Advance by a number of steps under constant torques."""
         self._mujoco.mj_step(self.model, self.data, nstep=steps)
 
     def gap(self) -> float:
-        """Return how far joint 3 is open [m]."""
+        """Return the gap of joint 3 [m]."""
         self._mujoco.mj_kinematics(self.model, self.data)
         ends = self.data.site_xpos
         return float(np.linalg.norm(ends[1] - ends[0]))
@@ -202,23 +203,23 @@ class MujocoLinkage:
     def move(self, state: State, times: Array, torques_at: Callable[[float], Array],
              sampled: float = 0.0) -> State:
         """
-        Follow a motion from a state.
+        Simulate a motion from a state.
 
         :param state: at times[0].
         :param times: (n,) increasing, whole multiples of the step apart [s].
         :param torques_at: time [s] to (4,) torques [N m], as in :meth:`apply`.
-        :param sampled: when in each step to ask for the torques held over it, in steps: 0 at its
-            start, 0.5 in its middle. For a torque that is a smooth function of time the start is
-            late by half a step on average, the middle is not.
+        :param sampled: time in each step at which the held torques are sampled, in steps: 0 at its
+            start, 0.5 in its middle. A smooth torque sampled at the start is late by half a step
+            on average.
         :returns: (n, ...) the state at every time.
-        :raises MujocoError: times that are no whole multiples of the step apart, or a motion that
-            MuJoCo gave up.
+        :raises MujocoError: times that are not whole multiples of the step apart, or a motion that
+            diverged.
         """
         counts = np.diff(times) / self.timestep
         whole = np.rint(counts).astype(int)
         if (np.abs(counts - whole) > _ROUNDING).any() or (whole < 1).any():
             raise MujocoError(f'times must be whole multiples of the step of {self.timestep:g} s '
-                              'apart, and increasing')
+                              'apart, and increasing', name='times', limit=self.timestep)
         self.set_state(state)
         states = [self.state()]
         for begin, count in zip(times, whole):
@@ -226,10 +227,10 @@ class MujocoLinkage:
                 self.apply(torques_at(begin + (i + sampled) * self.timestep))
                 self.advance()
             states.append(self.state())
-        # MuJoCo starts over, at time 0, where a state leaves the sensible numbers.
+        # MuJoCo restarts at time 0 when a state diverges.
         if abs(self.data.time - (times[-1] - times[0])) > 0.5 * self.timestep:
-            raise MujocoError(f'MuJoCo gave up a motion: its step of {self.timestep:g} s is too '
-                              'long for it')
+            raise MujocoError(f'the motion diverged: the step of {self.timestep:g} s is too long',
+                              value=self.timestep)
         return State(*(np.array([getattr(state, item.name) for state in states])
                        for item in fields(State)))
 
@@ -274,7 +275,7 @@ def model_xml(mechanism: Mechanism, settings: Settings, locked: Sequence[bool]) 
             </body>"""
 
     def inertial(x: float, y: float, mass: float, inertia: float) -> str:
-        # In the plane only the last of the three counts; a sphere has all of them alike.
+        # In the plane only the last of the three matters; those of a sphere are equal.
         return (f'<inertial pos="{x!r} {y!r} 0" mass="{mass!r}" '
                 f'diaginertia="{inertia!r} {inertia!r} {inertia!r}"/>')
 
@@ -291,7 +292,7 @@ def model_xml(mechanism: Mechanism, settings: Settings, locked: Sequence[bool]) 
           <option integrator="{settings.integrator}" timestep="{settings.timestep!r}"
               gravity="0 0 0" tolerance="{settings.tolerance!r}"
               iterations="{settings.iterations}">
-            <flag {' '.join(f'{stage}="disable"' for stage in NEEDLESS if settings.lean)}/>
+            <flag {' '.join(f'{stage}="disable"' for stage in UNUSED if settings.lean)}/>
           </option>
           <worldbody>{tree}
           </worldbody>
