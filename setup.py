@@ -19,6 +19,7 @@ EXTRAS = {
     'analysis': [
         'cma>=3.3',
         'dask[distributed]>=2024.1',
+        'loky>=3.4',
         'matplotlib>=3.7',
         'pyarrow>=14',
         'rosbags>=0.11',

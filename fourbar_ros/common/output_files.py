@@ -39,6 +39,9 @@ def atomic_file(path: Path) -> Iterator[TextIO]:
                 prefix=f'.{path.name}.', delete=False) as file:
             name = file.name
             yield cast(TextIO, file)
+            # So that the name never stands for a file that a power failure left empty.
+            file.flush()
+            os.fsync(file.fileno())
         os.chmod(name, 0o666 & ~_umask())
         os.replace(name, path)
     except BaseException as error:

@@ -177,6 +177,10 @@ class Settings:
         rows = settings_of(cls)
         check_keys(values, [row.name for row in rows if row.default is MISSING], place,
                    SettingError, optional=[row.name for row in rows])
+        if place and not cls.section:
+            for row in rows:
+                if row.name in values:
+                    row.check(values[row.name], f'{place}.{row.name}')
         return cls(**values)
 
 

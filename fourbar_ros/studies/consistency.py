@@ -30,9 +30,9 @@ from fourbar_ros.mechanism import assemble, LINK_NAMES
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plant.table import Disturbance, Table, WheelEncoders
 from fourbar_ros.studies import figures, Result, Sample
-from fourbar_ros.studies.campaigns.processes import in_processes
+from fourbar_ros.studies.campaigns.workers import map_ordered
 from fourbar_ros.studies.consistency_runs import bound_of, follow, FREE, LAGS, Tally
-from fourbar_ros.studies.consistency_statistics import (
+from fourbar_ros.studies.estimator_statistics import (
     autocorrelation,
     chi_square_bounds,
     share_inside,
@@ -197,7 +197,7 @@ def run(progress: Progress, sample: Sample) -> Result:
     scenarios = [replace(case.scenario, seed=sample.seed + number)
                  for case in chosen for number in range(sample.runs)]
     tallies: list[Tally] = []
-    with contextlib.closing(in_processes(follow, scenarios, sample.jobs)) as runs:
+    with contextlib.closing(map_ordered(follow, scenarios, sample.jobs)) as runs:
         done = cast(Iterable[Tally], progress(runs, len(scenarios)))
         for number, tally in enumerate(done):
             if number % sample.runs:

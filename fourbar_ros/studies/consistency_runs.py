@@ -18,7 +18,7 @@ from fourbar_ros.loop import make_loop, run_scenario, Scenario, Step
 from fourbar_ros.mechanism import JOINT_LINKS, LINK_NAMES
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix
-from fourbar_ros.studies.consistency_statistics import (
+from fourbar_ros.studies.estimator_statistics import (
     lagged_products,
     normalised_squares,
     posterior_bound,

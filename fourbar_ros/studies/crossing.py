@@ -25,10 +25,10 @@ from fourbar_ros.common.progress import Progress
 from fourbar_ros.loop.warm_up import warm_up
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.studies import figures, Result, Sample
-from fourbar_ros.studies.campaigns.processes import in_processes
+from fourbar_ros.studies.campaigns.workers import map_ordered
 from fourbar_ros.studies.crossing_runs import Crossing, go, METHODS, Passage, Run
-from fourbar_ros.studies.proportions import share_interval
 import numpy as np
+from scipy.stats import binomtest
 
 # So many of a hundred runs of four wheels with feedback must pass.
 LEAST_PASSED = 99.0
@@ -89,7 +89,8 @@ class Tally:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % confidence interval of the share that passes (Clopper and Pearson 1934)."""
-        return share_interval(self.passed, self.runs)
+        low, high = binomtest(self.passed, self.runs).proportion_ci()
+        return float(low), float(high)
 
     @property
     def reasons(self) -> dict[str, int]:
@@ -118,7 +119,7 @@ def run(progress: Progress, sample: Sample) -> Result:
                'four_held', fewer) for mismatch, stiffness, time in cells]
     runs = [Run(crossing, method, sample.seed + number)
             for crossing, method, count in kinds for number in range(count)]
-    with contextlib.closing(in_processes(go, runs, sample.jobs)) as found:
+    with contextlib.closing(map_ordered(go, runs, sample.jobs)) as found:
         passages = list(cast(Iterable[Passage], progress(found, len(runs))))
     tallies, done = [], 0
     for _, _, count in kinds:

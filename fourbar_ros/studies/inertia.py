@@ -27,7 +27,7 @@ from fourbar_ros.mechanism import assemble, load_mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.state import make_state
 from fourbar_ros.studies import figures, Result, Sample, StudyError
-from fourbar_ros.studies.campaigns.processes import in_processes
+from fourbar_ros.studies.campaigns.workers import map_ordered
 from fourbar_ros.studies.energy import turn
 from fourbar_ros.studies.inertia_search import (
     Candidate,
@@ -82,7 +82,7 @@ def run(progress: Progress, sample: Sample, folder: Path | None) -> Result:
     """
     listed, results = searches(sample.seed), []
     search_or_resume = partial(_resume, folder=folder)
-    with contextlib.closing(in_processes(
+    with contextlib.closing(map_ordered(
             search_or_resume, [search for _, search in listed], sample.jobs)) as done:
         shown = progress(done, len(listed))
         for (kind, search), (variables, evaluations) in zip(listed, shown):

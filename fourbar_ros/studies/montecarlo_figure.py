@@ -12,10 +12,10 @@ from math import ceil
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plotting import style
 from fourbar_ros.plotting.style import COLOURS, LINK_COLOURS
-from fourbar_ros.studies.campaigns.draws import Parameter
-from fourbar_ros.studies.campaigns.file import Limit
-from fourbar_ros.studies.campaigns.run import METRICS
-from fourbar_ros.studies.campaigns.summary import Correlation, Statistics
+from fourbar_ros.studies.campaigns.campaign import Limit
+from fourbar_ros.studies.campaigns.campaign_run import METRICS
+from fourbar_ros.studies.campaigns.campaign_summary import Correlation, Statistics
+from fourbar_ros.studies.campaigns.distributions import Parameter
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -73,7 +73,7 @@ def scatter_png(parameters: Sequence[Parameter], drawn: Mapping[str, Array],
     :param drawn, metrics: (runs,) by name, NaN for none.
     :param strongest: in this order.
     """
-    labels = {name: name + HOW[parameter.how] for parameter in parameters
+    labels = {name: name + HOW[parameter.distribution.how] for parameter in parameters
               for name in parameter.columns}
 
     def draw() -> Figure:

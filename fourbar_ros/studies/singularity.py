@@ -32,7 +32,7 @@ from fourbar_ros.mechanism.integration import move_held
 from fourbar_ros.mechanism.mechanism import JOINT_LINKS
 from fourbar_ros.mechanism.state import LINK_ANGLES, make_state
 from fourbar_ros.studies import cores, figures, Result
-from fourbar_ros.studies.campaigns.processes import in_processes
+from fourbar_ros.studies.campaigns.workers import map_ordered
 from fourbar_ros.studies.crossing import CROSSINGS
 from fourbar_ros.studies.crossing_runs import go, Passage, Run
 import numpy as np
@@ -103,7 +103,7 @@ def run(progress: Progress) -> Result:
     mechanism = load_mechanism('prototype')
     methods = ('four_held', 'two')
     runs = [Run(PARKING, method, 0) for method in methods]
-    with contextlib.closing(in_processes(go, runs, min(cores(), len(runs)))) as found:
+    with contextlib.closing(map_ordered(go, runs, min(cores(), len(runs)))) as found:
         parked = dict(zip(methods, progress(found, len(runs))))
     numbers = over_theta(mechanism)
     opened = {'opposite_wheels': driven_apart(mechanism, np.array([1.0, 0.0, -1.0, 0.0]), NOTHING),

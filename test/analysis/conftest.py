@@ -9,7 +9,6 @@ from pathlib import Path
 
 from fourbar_ros.loop import load_scenario
 import pytest
-import yaml
 
 
 @pytest.fixture(scope='session')
@@ -38,28 +37,3 @@ def loop_messages(synthetic):
 def loop_bag(synthetic, loop_messages, tmp_path_factory):
     """Return the bag of it."""
     return synthetic.write_bag(tmp_path_factory.mktemp('loop') / 'bag', loop_messages)
-
-
-SHORT_RUNS = {
-    'scenario': 'prototype', 'runs': 12, 'seed': 5, 'duration': 0.3,
-    'set': {'arm_at': 0.05, 'setpoints[0].at': 0.08, 'setpoints[0].duration': 0.15,
-            'setpoints[0].relative': {'link_a': 1e-3, 'link_b': 1e-3}},
-    'vary': {
-        'mechanism.flywheel_inertias': {'uniform': [0.9, 1.1], 'scale': True, 'each': True},
-        'table.link_sensors.noise_rms': {'loguniform': [0.5, 2.0], 'scale': True},
-        'controller.allocation': {'choice': ['bounded', 'min_norm']}},
-}
-"""A campaign of runs that take a moment."""
-
-
-@pytest.fixture
-def campaign_file(tmp_path):
-    """Return a function that writes a campaign of short runs, with changes, and its path."""
-    def write(name='short', **changes):
-        values = {**SHORT_RUNS, **changes}
-        path = tmp_path / f'{name}.yaml'
-        path.write_text(yaml.safe_dump(
-            {key: value for key, value in values.items() if value is not None},
-            sort_keys=False))
-        return str(path)
-    return write

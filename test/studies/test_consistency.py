@@ -5,19 +5,14 @@
 
 from dataclasses import replace
 from math import inf, isnan, nan
-import os
-import signal
-import subprocess
-import sys
 
 from fourbar_ros.estimation import filter as estimation_filter
 from fourbar_ros.loop import load_scenario, run_scenario, Scenario
 from fourbar_ros.plant import plant as plant_module
 from fourbar_ros.studies import consistency
-from fourbar_ros.studies.campaigns.processes import CampaignError, in_processes
 from fourbar_ros.studies.consistency import Case, Outcome
 from fourbar_ros.studies.consistency_runs import bound_of, follow, near_reversals
-from fourbar_ros.studies.consistency_statistics import (
+from fourbar_ros.studies.estimator_statistics import (
     autocorrelation,
     chi_square_bounds,
     lagged_products,
@@ -201,38 +196,3 @@ def test_filter_that_is_too_sure_of_itself_is_missed(scenario: Scenario) -> None
     assert not verdicts['wrong']['matched, steps with NEES in its 95 % bounds']
     assert not verdicts['wrong']['matched, rms error / bound, phi_a']
     assert verdicts['wrong']['matched, runs in which a sensor was named faulty']
-
-
-def test_processes_give_back_in_order_what_they_were_given() -> None:
-    assert list(in_processes(abs, [-3, 2, -1], 2)) == [3, 2, 1]
-    assert list(in_processes(abs, [-3], 2)) == [3]
-    assert list(in_processes(abs, [-3, -1], 1)) == [3, 1]
-
-
-def test_process_that_dies_is_told() -> None:
-    with pytest.raises(CampaignError, match='died'):
-        list(in_processes(os._exit, [1, 1], 2))
-
-
-@pytest.mark.node
-def test_interrupt_of_all_processes_ends_them_without_a_word() -> None:
-    # Whoever was started in the background ignores interrupts.
-    code = ('import signal, time\n'
-            'from fourbar_ros.studies.campaigns.processes import in_processes\n'
-            'if __name__ == "__main__":\n'
-            '    signal.signal(signal.SIGINT, signal.default_int_handler)\n'
-            '    try:\n'
-            '        for _ in in_processes(time.sleep, [0.2] * 500, 2):\n'
-            '            print("running", flush=True)\n'
-            '    except KeyboardInterrupt:\n'
-            '        print("interrupted", flush=True)\n')
-    process = subprocess.Popen([sys.executable, '-c', code], stdout=subprocess.PIPE,
-                               stderr=subprocess.PIPE, text=True, start_new_session=True)
-    assert process.stdout is not None
-    process.stdout.readline()
-    os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=20.0)
-    # It may come between a word and the end of its line.
-    assert out.endswith('interrupted\n')
-    assert err == ''
-    assert process.returncode == 0

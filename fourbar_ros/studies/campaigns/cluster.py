@@ -2,81 +2,161 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Runs of a campaign on a Dask cluster that somebody else has started.
+Workers of a Dask cluster that already runs.
 
-Whoever reaches a scheduler can run code on its workers and on its clients, so it must be one of a
-network that is trusted (docs/campaigns.md).
+Every program that reaches a scheduler can execute code on its workers and clients, so the cluster
+must be in a trusted network (docs/campaigns.md).
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import logging
-from queue import Empty, SimpleQueue
 import time
 from typing import Any
 
-from fourbar_ros.studies.campaigns.file import Campaign
-from fourbar_ros.studies.campaigns.processes import CampaignError
-from fourbar_ros.studies.campaigns.run import do_batch, lost_run, Row
-from fourbar_ros.studies.campaigns.versions import difference, versions
+from fourbar_ros.studies.campaigns import CampaignError
+from fourbar_ros.studies.campaigns.versions import difference
+from fourbar_ros.studies.campaigns.workers import WorkerLostError
 
-# How long to wait for a scheduler, for its first worker, and for one after all have gone [s].
-CONNECTING, FIRST_WORKER, NO_WORKER = 5.0, 15.0, 60.0
-# How long a scheduler or a worker that was there before may take to answer [s].
-ANSWER = 30.0
-# How often to look whether the cluster is still there [s].
-LOOK = 1.0
-# Batches that are given away beforehand, for each thread of the workers.
-AHEAD = 3
-# Dask's is that of asyncio, which is one of its own in Python 3.10.
+CONNECT_TIMEOUT = 5.0
+"""Longest wait for the connection to the scheduler [s]."""
+FIRST_WORKER_TIMEOUT = 15.0
+"""Longest wait for the first worker [s]."""
+NO_WORKER_TIMEOUT = 60.0
+"""Longest time without workers after the first one [s]."""
+ANSWER_TIMEOUT = 30.0
+"""Longest wait for an answer of a scheduler or worker that is connected [s]."""
+BATCHES_PER_THREAD = 3
+"""Batches submitted at a time per thread of the workers; hides the latency of the network."""
+# In Python 3.10 asyncio's error, which Dask raises, is a type of its own.
 _TIMED_OUT = (TimeoutError, asyncio.TimeoutError)
 
 
-def on_cluster(campaign: Campaign, batches: Sequence[Sequence[int]], address: str
-               ) -> Generator[list[Row], None, None]:
+class ClusterWorkers:
     """
-    Make runs on the workers of a scheduler.
+    Workers of a scheduler.
 
-    :param batches: numbers of the runs that are made together.
     :param address: of the scheduler, `tcp://HOST:PORT`.
-    :returns: rows of one batch after the other, as they are ready. A run that takes every worker
-        with it on which it is tried has a row that says so; it is tried at last with nothing else
-        on the cluster, since Dask blames all that a dead worker had.
-    :raises CampaignError: there is no such scheduler, or not any more; it answers no more, as one
-        that is halted or unplugged; workers have other versions; distributed is not installed.
+    :param versions: that the workers must have, see `campaigns.versions`.
+    :raises CampaignError: no scheduler or worker there, a worker has other versions, or
+        `distributed` is not installed.
     """
-    try:
-        import distributed
-        from distributed.comm.core import CommClosedError
-    except ImportError as error:
-        raise CampaignError(f'--scheduler needs {error.name}: pip install '
-                            'fourbar_ros[analysis]') from None
-    with _quiet():
+
+    def __init__(self, address: str, versions: Mapping[str, str]) -> None:
         try:
-            _check_address(address)
-            client = distributed.Client(address, timeout=CONNECTING, set_as_default=False)
-        except (OSError, *_TIMED_OUT, ValueError, ImportError) as error:
-            reason = (f'within {CONNECTING:g} s' if isinstance(error, (OSError, *_TIMED_OUT))
-                      else f'({_line(error)})')
-            raise CampaignError(f'no scheduler at {address} {reason}: start one with '
-                                '`dask scheduler`, or leave --scheduler away') from None
+            import distributed
+            from distributed.comm.core import CommClosedError
+        except ImportError as error:
+            raise CampaignError(f'--scheduler needs {error.name}: pip install '
+                                'fourbar_ros[analysis]', name=error.name) from None
+        self._killed = distributed.KilledWorker
+        self._gone = (OSError, distributed.CancelledError, CommClosedError)
+        self._address = address
+        self._last_seen = time.monotonic()
+        with contextlib.ExitStack() as opened:
+            opened.enter_context(_dask_silenced())
+            try:
+                _check_address(address)
+                self._client: Any = distributed.Client(
+                    address, timeout=CONNECT_TIMEOUT, set_as_default=False)
+            except (OSError, *_TIMED_OUT, ValueError, ImportError) as error:
+                reason = (f'within {CONNECT_TIMEOUT:g} s'
+                          if isinstance(error, (OSError, *_TIMED_OUT))
+                          else f'({_one_line(error)})')
+                raise CampaignError(
+                    f'no scheduler at {address} {reason}: start one with `dask scheduler`, or '
+                    'omit --scheduler', address=address) from None
+            opened.callback(self._disconnect)
+            self._check_workers(versions)
+            self._opened = opened.pop_all()
+
+    def capacity(self) -> int:
+        """
+        Return the number of batches to submit at a time.
+
+        :raises CampaignError: the scheduler or all workers disappeared or do not answer.
+        """
+        with self._errors_translated():
+            threads = sum(self._client.sync(
+                self._client.scheduler.ncores, workers=None,
+                callback_timeout=ANSWER_TIMEOUT).values())
+        if self._client.status != 'running':
+            raise self._error('is gone')
+        if threads:
+            self._last_seen = time.monotonic()
+        elif time.monotonic() - self._last_seen > NO_WORKER_TIMEOUT:
+            raise self._error(f'has had no workers for {NO_WORKER_TIMEOUT:g} s')
+        return BATCHES_PER_THREAD * max(int(threads), 1)
+
+    def submit(self, work: Callable[..., Any], *arguments: Any) -> Any:
+        """Return a future of `work(*arguments)`."""
+        with self._errors_translated():
+            return self._client.submit(work, *arguments, pure=False)
+
+    def result(self, future: Any) -> Any:
+        """Return the result of a future that is done."""
         try:
-            _check_workers(client, address, campaign)
-            yield from _spread(client, address, campaign, batches)
-        finally:
-            with contextlib.suppress(OSError, *_TIMED_OUT, CommClosedError):
-                client.close(timeout=2.0)
+            with self._errors_translated():
+                return future.result(timeout=ANSWER_TIMEOUT)
+        except self._killed:
+            raise WorkerLostError from None
+
+    def close(self) -> None:
+        """Disconnect; the scheduler cancels what is not finished."""
+        self._opened.close()
+
+    def _disconnect(self) -> None:
+        with contextlib.suppress(*self._gone, *_TIMED_OUT):
+            self._client.close(timeout=2.0)
+
+    def _check_workers(self, versions: Mapping[str, str]) -> None:
+        """Refuse workers that compute other numbers than this process."""
+        try:
+            self._client.wait_for_workers(1, timeout=FIRST_WORKER_TIMEOUT)
+        except _TIMED_OUT:
+            raise self._error('has no workers: start some with '
+                              f'`dask worker {self._address} --nthreads 1`') from None
+        try:
+            answers = self._client.run(
+                _versions_query(), on_error='return', callback_timeout=ANSWER_TIMEOUT)
+        except _TIMED_OUT:
+            raise self._error('or one of its workers does not answer within '
+                              f'{ANSWER_TIMEOUT:g} s', limit=ANSWER_TIMEOUT) from None
+        for worker, answer in answers.items():
+            if isinstance(answer, BaseException):
+                problem = f'cannot report its versions: {_one_line(answer)}'
+            elif not answer:
+                problem = (f'has no fourbar_ros: install {versions["fourbar_ros"]} there, as '
+                           'here')
+            elif differs := difference(versions, answer):
+                problem = f'has other versions: {differs}'
+            else:
+                continue
+            raise CampaignError(f'worker {worker} {problem}', worker=worker, versions=answer)
+
+    @contextlib.contextmanager
+    def _errors_translated(self) -> Iterator[None]:
+        try:
+            yield
+        except _TIMED_OUT:
+            raise self._error(f'has not answered for {ANSWER_TIMEOUT:g} s',
+                              limit=ANSWER_TIMEOUT) from None
+        except self._gone:
+            raise self._error('is gone') from None
+
+    def _error(self, problem: str, **values: Any) -> CampaignError:
+        return CampaignError(f'the scheduler {self._address} {problem}',
+                             address=self._address, **values)
 
 
 def _check_address(address: str) -> None:
     """
-    See that a client can be made: one that cannot prints a traceback when it is deleted.
+    Check that a client can connect: one that cannot prints a traceback when it is deleted.
 
-    :raises ValueError: it cannot; says why.
+    :raises ValueError: address or TLS configuration is wrong.
     """
     from distributed import Security
     from distributed.comm.addressing import get_address_host_port
@@ -87,38 +167,16 @@ def _check_address(address: str) -> None:
         context = security.get_connection_args('client').get('ssl_context')
     except (OSError, ValueError) as error:
         raise ValueError("the certificates of Dask's configuration cannot be read: "
-                         f'{_line(error)}') from None
+                         f'{_one_line(error)}') from None
     if address.startswith('tls://') and context is None:
         raise ValueError("tls needs certificate, key and CA in Dask's configuration")
     if security.require_encryption and not address.startswith('tls://'):
         raise ValueError("Dask's configuration requires encryption, tls://")
 
 
-def _check_workers(client: Any, address: str, campaign: Campaign) -> None:
-    """See that there are workers, and that they make the same numbers as this process."""
-    try:
-        client.wait_for_workers(1, timeout=FIRST_WORKER)
-    except _TIMED_OUT:
-        raise CampaignError(f'the scheduler {address} has no workers: start some with '
-                            f'`dask worker {address} --nthreads 1`') from None
-    try:
-        found = client.run(_asked(), on_error='return', callback_timeout=ANSWER)
-    except _TIMED_OUT:
-        raise CampaignError(f'the scheduler {address} or one of its workers does not answer '
-                            f'within {ANSWER:g} s') from None
-    for worker, there in found.items():
-        if isinstance(there, BaseException):
-            raise CampaignError(f'worker {worker} cannot say its versions: {_line(there)}')
-        if not there:
-            raise CampaignError(f'worker {worker} has no fourbar_ros: install '
-                                f'{campaign.versions["fourbar_ros"]} there, as here')
-        if differs := difference(dict(campaign.versions), there):
-            raise CampaignError(f'worker {worker} has other versions: {differs}')
-
-
-def _asked() -> Callable[[], dict[str, str]]:
-    """Return a function that goes to the workers whole, since they may not know this module."""
-    def ask() -> dict[str, str]:
+def _versions_query() -> Callable[[], dict[str, str]]:
+    """Return a function that is pickled by value, since workers may lack this module."""
+    def query() -> dict[str, str]:
         from importlib import import_module
         try:
             module = import_module('fourbar_ros.studies.campaigns.versions')
@@ -126,89 +184,24 @@ def _asked() -> Callable[[], dict[str, str]]:
             return {}
         found: dict[str, str] = module.versions()
         return found
-    return ask
-
-
-def _spread(client: Any, address: str, campaign: Campaign, batches: Sequence[Sequence[int]]
-            ) -> Generator[list[Row], None, None]:
-    import distributed
-    from distributed.comm.core import CommClosedError
-
-    gone = CampaignError(f'the scheduler {address} is gone')
-    waiting = deque(tuple(batch) for batch in batches)
-    suspects: deque[int] = deque()
-    alone = False
-    running: dict[Any, tuple[int, ...]] = {}
-    ready: SimpleQueue[Any] = SimpleQueue()
-    seen = time.monotonic()
-    try:
-        while waiting or running or suspects:
-            threads = sum(client.sync(
-                client.scheduler.ncores, workers=None, callback_timeout=ANSWER).values())
-            if threads:
-                seen = time.monotonic()
-            elif time.monotonic() - seen > NO_WORKER:
-                raise CampaignError(f'the scheduler {address} has had no workers for '
-                                    f'{NO_WORKER:g} s')
-            if suspects and not waiting and not running:
-                alone = True
-                waiting.append((suspects.popleft(),))
-            while waiting and len(running) < AHEAD * max(threads, 1):
-                batch = waiting.popleft()
-                future = client.submit(work, campaign, batch, pure=False)
-                running[future] = batch
-                future.add_done_callback(ready.put)
-            for future in _next(ready):
-                batch = running.pop(future)
-                try:
-                    yield future.result(timeout=ANSWER)
-                except distributed.KilledWorker:
-                    if not alone:
-                        suspects.extend(batch)
-                    else:
-                        yield [lost_run(campaign, batch[0], 'every worker that took it died, by '
-                                                            'lack of memory perhaps')]
-            if client.status != 'running':
-                raise gone
-    except _TIMED_OUT:
-        raise CampaignError(f'the scheduler {address} has not answered for {ANSWER:g} s') from None
-    except (OSError, distributed.CancelledError, CommClosedError):
-        raise gone from None
-    finally:
-        with contextlib.suppress(Exception):  # noqa: BLE001 - the scheduler may be anything now
-            client.cancel(list(running))
-
-
-def _next(ready: SimpleQueue[Any]) -> Iterator[Any]:
-    """Return what is ready, after waiting a while for the first."""
-    with contextlib.suppress(Empty):
-        yield ready.get(timeout=LOOK)
-        while True:
-            yield ready.get_nowait()
-
-
-def work(campaign: Campaign, batch: Sequence[int]) -> list[Row]:
-    """Make some runs on a worker, which may have come later than the check."""
-    if differs := difference(dict(campaign.versions), versions()):
-        raise CampaignError(f'a worker that came later has other versions: {differs}')
-    return do_batch(campaign, batch)
+    return query
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep what Dask logs of lost connections to itself: it is said in one line."""
-    # Dask gives some of its loggers levels of their own.
+def _dask_silenced() -> Iterator[None]:
+    """Silence Dask's log of lost connections: the error of the campaign reports them."""
+    # Dask sets levels of its own on some of its loggers.
     loggers = [logging.getLogger(name) for name in (
         'distributed', 'distributed.client', 'distributed.core', 'distributed.comm')]
-    before = [logger.level for logger in loggers]
+    levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.CRITICAL + 1)
     try:
         yield
     finally:
-        for logger, level in zip(loggers, before):
+        for logger, level in zip(loggers, levels):
             logger.setLevel(level)
 
 
-def _line(error: BaseException) -> str:
+def _one_line(error: BaseException) -> str:
     return ' '.join(str(error).split())[:120] or type(error).__name__

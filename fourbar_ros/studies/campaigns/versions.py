@@ -1,10 +1,11 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The versions of what makes the numbers of a run: the same ones make the same numbers."""
+"""Versions of the software that computes the numbers of a run."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
 import hashlib
 from importlib import metadata
@@ -13,17 +14,18 @@ import platform
 
 import fourbar_ros
 
-# What a closed loop without ROS is made of, what draws it, and what measures it.
 ROOMS = ('common', 'control', 'device', 'estimation', 'kernels', 'loop', 'mechanism', 'plant')
-MODULES = ('studies/campaigns/draws.py', 'studies/campaigns/file.py',
-           'studies/campaigns/names.py', 'studies/campaigns/run.py',
-           'studies/consistency_statistics.py')
+"""Rooms that a closed loop without ROS consists of."""
+MODULES = ('studies/campaigns/campaign.py', 'studies/campaigns/campaign_run.py',
+           'studies/campaigns/distributions.py', 'studies/campaigns/parameter_names.py',
+           'studies/estimator_statistics.py')
+"""Modules that draw its parameters and compute its metrics."""
 LIBRARIES = ('numpy', 'scipy', 'numba', 'filterpy')
 
 
 @lru_cache(maxsize=None)
 def versions() -> dict[str, str]:
-    """Return versions by name; `sources` tells apart what has the same number."""
+    """Return versions by name; `sources` is a hash of the sources, for equal version numbers."""
     package = Path(fourbar_ros.__file__).parent
     digest = hashlib.sha256()
     for source in sources():
@@ -35,13 +37,13 @@ def versions() -> dict[str, str]:
 
 
 def sources() -> list[Path]:
-    """Return the files of which the numbers are made, sorted."""
+    """Return the source files that determine the numbers, sorted."""
     package = Path(fourbar_ros.__file__).parent
     return sorted([*(path for room in ROOMS for path in (package / room).rglob('*.py')),
                    *(package / name for name in MODULES)])
 
 
-def difference(here: dict[str, str], there: dict[str, str]) -> str:
-    """Return what differs, in words, or ''."""
+def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
+    """Return the versions that differ as a text, '' if none does."""
     return ', '.join(f'{name} {there.get(name, "none")}, here {version}'
                      for name, version in here.items() if there.get(name) != version)

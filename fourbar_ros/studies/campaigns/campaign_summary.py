@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the runs of a campaign have in common: statistics, correlations, limits."""
+"""Statistics over the runs of a campaign: moments, quantiles, correlations, checks of limits."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ from math import nan, sqrt
 
 from fourbar_ros.common.checks import at_least, at_most, Check
 from fourbar_ros.mechanism.constants import Array
-from fourbar_ros.studies.campaigns.file import Campaign, FAILURE_RATE, Limit
-from fourbar_ros.studies.campaigns.run import METRICS
+from fourbar_ros.studies.campaigns.campaign import FAILURE_RATE, Limit
+from fourbar_ros.studies.campaigns.campaign_run import METRICS
 import numpy as np
-from scipy.stats import rankdata
-from scipy.stats import t as student
+from scipy import stats
 
 CONFIDENCE = 0.95
+"""Confidence of all intervals."""
 QUANTILES = (0.05, 0.5, 0.95)
-# With fewer runs a correlation says nothing.
-FEWEST = 5
+"""Quantiles of the metrics that are reported."""
+FEWEST_RUNS = 5
+"""Smallest number of runs for a correlation; with fewer it is not significant."""
 
 
 @dataclass(frozen=True)
 class Statistics:
     """
-    Of a metric, over the runs that have it.
+    Statistics of a metric, over the runs in which it is defined.
 
-    :param n: how many have it.
-    :param mean, std: std with n - 1.
-    :param mean_low, mean_high: 95 % confidence interval of the mean, after Student.
+    :param n: number of these runs.
+    :param mean, std: std with n - 1 degrees of freedom.
+    :param mean_low, mean_high: 95 % confidence interval of the mean, by Student's t.
     :param quantiles: at `QUANTILES`.
     """
 
@@ -45,10 +46,10 @@ class Statistics:
 @dataclass(frozen=True)
 class Correlation:
     """
-    Rank correlation of a drawn parameter with a metric, after Spearman.
+    Spearman's rank correlation of a drawn parameter with a metric.
 
-    :param n: runs.
-    :param p_value: of as large a one by chance.
+    :param n: number of runs.
+    :param p_value: probability of a correlation at least as large without dependence.
     """
 
     parameter: str
@@ -60,9 +61,9 @@ class Correlation:
 
 def statistics(values: Array) -> Statistics:
     """
-    Describe a sample.
+    Return the statistics of a sample.
 
-    :param values: (n,), NaN for none.
+    :param values: (n,), NaN where undefined.
     """
     known = values[np.isfinite(values)]
     n = len(known)
@@ -70,9 +71,9 @@ def statistics(values: Array) -> Statistics:
         return Statistics(0, nan, nan, nan, nan, (nan,) * len(QUANTILES))
     mean = float(known.mean())
     std = float(known.std(ddof=1)) if n > 1 else nan
-    half = float(student.ppf(0.5 + 0.5 * CONFIDENCE, n - 1)) * std / sqrt(n) if n > 1 else nan
+    half = float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, n - 1)) * std / sqrt(n) if n > 1 else nan
     return Statistics(n, mean, std, mean - half, mean + half,
-                      tuple(float(each) for each in np.quantile(known, QUANTILES)))
+                      tuple(np.quantile(known, QUANTILES).tolist()))
 
 
 def correlations(parameters: Mapping[str, Array], metrics: Mapping[str, Array]
@@ -80,32 +81,29 @@ def correlations(parameters: Mapping[str, Array], metrics: Mapping[str, Array]
     """
     Correlate each parameter with each metric, the strongest first.
 
-    :param parameters, metrics: (runs,) by name, NaN for none; what is the same in all runs, and
-        so correlates with nothing, is left out.
+    :param parameters, metrics: (runs,) by name, NaN where undefined; constant ones are skipped.
     """
     found = []
     for name, values in parameters.items():
         for metric, results in metrics.items():
             known = np.isfinite(values) & np.isfinite(results)
             n = int(known.sum())
-            if n < FEWEST or np.ptp(values[known]) == 0.0 or np.ptp(results[known]) == 0.0:
+            if n < FEWEST_RUNS or np.ptp(values[known]) == 0.0 or np.ptp(results[known]) == 0.0:
                 continue
-            rho = float(np.corrcoef(rankdata(values[known]), rankdata(results[known]))[0, 1])
-            scaled = rho * sqrt((n - 2) / max(1.0 - rho * rho, 1e-300))
+            spearman = stats.spearmanr(values[known], results[known])
             found.append(Correlation(
-                name, metric, n, rho, float(2.0 * student.sf(abs(scaled), n - 2))))
+                name, metric, n, float(spearman.statistic), float(spearman.pvalue)))
     return sorted(found, key=lambda each: (-abs(each.rho), each.parameter, each.metric))
 
 
 def checks_of(limits: Sequence[Limit], metrics: Mapping[str, Array], failed: int) -> list[Check]:
     """
-    Compare with the limits of a campaign.
+    Check the limits of a campaign.
 
-    A run without the metric counts as one beyond any limit of a quantile; the mean is of those
-    that have it.
+    In a quantile a run without the metric counts as beyond any limit; a mean ignores it.
 
-    :param metrics: (runs,) by name, NaN for none.
-    :param failed: number of runs that failed.
+    :param metrics: (runs,) by name, NaN where undefined.
+    :param failed: number of failed runs.
     """
     checks = []
     for limit in limits:
@@ -127,8 +125,3 @@ def checks_of(limits: Sequence[Limit], metrics: Mapping[str, Array], failed: int
         elif limit.at_least is not None:
             checks.append(at_least(name, value, unit, limit.at_least))
     return checks
-
-
-def numeric_columns(campaign: Campaign) -> list[str]:
-    """Return what is drawn and has an order."""
-    return [name for name, kind in campaign.columns.items() if kind is not str]
