@@ -95,8 +95,8 @@ STUDIES = {
     'bus': Study('ten minutes of the prototype on a bus over loopback: lost frames, round trips'),
 }
 
+# Largest seed of a scenario.
 LARGEST_SEED = 2 ** 63 - 1
-"""Largest seed of a scenario."""
 MOST_RUNS = 1_000_000
 MOST_JOBS = 1024
 

@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Runs of the closed loop, and what of them tells whether the estimator is consistent.
+Runs of the consistency study, each reduced to sums over its steps.
 
-A run is reduced to sums over its steps, which add up over runs whatever their number.
+The sums of several runs add up, so their number does not affect the memory.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from math import ceil, sqrt
 
 from fourbar_ros.estimation.estimator import INITIAL_ANGLE_SIGMA, INITIAL_RATE_SIGMA
@@ -18,6 +17,7 @@ from fourbar_ros.loop import make_loop, run_scenario, Scenario, Step
 from fourbar_ros.mechanism import JOINT_LINKS, LINK_NAMES
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix
+from fourbar_ros.studies.consistency_results import FREE, LAGS, RunSums
 from fourbar_ros.studies.estimator_statistics import (
     lagged_products,
     normalised_squares,
@@ -26,62 +26,15 @@ from fourbar_ros.studies.estimator_statistics import (
 import numpy as np
 from numpy.typing import NDArray
 
-# phi_a, phi_b, omega_a, omega_b and the two disturbance torques, in the state of the filter.
+# Indices of phi_a, phi_b, omega_a, omega_b and the disturbance torques in the filter's state.
 KEPT = np.array([0, 1, 4, 5, 8, 9])
-FREE = 4
-
-# Innovations are compared with those up to so many measurements later.
-LAGS = 25
-
-# How long friction in the joints keeps the estimate busy after it has changed its direction [s].
+# Time after a change of the friction regime in which the estimate may lag [s].
 AFTER_REVERSAL = 0.25
 
 
-@dataclass(frozen=True, eq=False)
-class Tally:
+def execute(scenario: Scenario) -> RunSums:
     """
-    Sums over runs, step by step.
-
-    :param runs: how many.
-    :param named: in how many of them a sensor was named faulty at any time.
-    :param estimates: (steps,) in how many there was an estimate.
-    :param squares: (steps, 6) squared errors of phi_a, phi_b [rad^2], omega_a, omega_b
-        [rad^2/s^2] and the disturbance torques, beside those that walk [(N m)^2].
-    :param link_squares: (steps, 8) squared errors of angles and rates of the four links.
-    :param nees: (steps,) of the first four of the six.
-    :param calm: (steps,) in how many runs there was an estimate, and no reversal of friction.
-    :param calm_nees: (steps,) NEES in these.
-    :param nis, degrees: (steps,) and its degrees of freedom.
-    :param products, pairs: (LAGS + 1, 4) of innovations, see `consistency.lagged_products`.
-    :param carried, crossed, driven, seen: see `consistency.posterior_bound`, of all six.
-    """
-
-    runs: int
-    named: int
-    estimates: NDArray[np.int64]
-    squares: Array
-    link_squares: Array
-    nees: Array
-    calm: NDArray[np.int64]
-    calm_nees: Array
-    nis: Array
-    degrees: NDArray[np.int64]
-    products: Array
-    pairs: NDArray[np.int64]
-    carried: Array
-    crossed: Array
-    driven: Array
-    seen: Array
-
-    def __add__(self, other: Tally) -> Tally:
-        """Add the runs of another one, of the same steps."""
-        return Tally(*(getattr(self, item.name) + getattr(other, item.name)
-                       for item in fields(Tally)))
-
-
-def follow(scenario: Scenario) -> Tally:
-    """
-    Run a scenario, once.
+    Run a scenario.
 
     :raises FourbarError: it cannot be run.
     """
@@ -121,7 +74,7 @@ def follow(scenario: Scenario) -> Tally:
     window = round(AFTER_REVERSAL * scenario.plant.rate)
     calm = known & ~near_reversals(rates, scenario.table.joints.smoothing, window)
     products, pairs = lagged_products(innovations, LAGS)
-    return Tally(
+    return RunSums(
         1, int(named), known.astype(np.int64), np.nan_to_num(errors) ** 2,
         np.nan_to_num(link_errors) ** 2, nees, calm.astype(np.int64), np.where(calm, nees, 0.0),
         nis, degrees, products, pairs,
@@ -130,32 +83,31 @@ def follow(scenario: Scenario) -> Tally:
 
 def near_reversals(link_rates: Array, slip: float, window: int) -> NDArray[np.bool_]:
     """
-    Tell which steps follow soon upon a change of friction in a joint.
+    Return the steps shortly after a change of the friction regime of a joint.
 
-    A joint slides one way, or the other, or it sticks. Friction is torn from one value to another
-    when it goes from one of these to another. A joint that goes on sticking gives no such jolt
-    however often its creep changes sign, and so does not count.
+    A joint slides in one direction, in the other, or sticks. Friction jumps when the regime
+    changes. The creep of a sticking joint may change sign without a jump, and does not count.
 
     :param link_rates: (steps, 4) [rad/s].
-    :param slip: a joint that turns more slowly sticks [rad/s].
-    :param window: for so many steps from the change on.
+    :param slip: relative rate below which a joint sticks [rad/s].
+    :param window: number of steps from the change on.
     :returns: (steps,).
     """
     relative = np.stack([link_rates[:, second] - link_rates[:, first]
                          for first, second in JOINT_LINKS], axis=1)
-    way = np.where(np.abs(relative) > slip, np.sign(relative), 0.0)
-    changed = np.zeros(len(way), np.int64)
-    changed[1:] = (np.diff(way, axis=0) != 0.0).any(axis=1)
-    so_far = np.cumsum(changed)
-    before = np.concatenate([np.zeros(window, np.int64), so_far])[:len(so_far)]
-    near: NDArray[np.bool_] = so_far > before
+    regime = np.where(np.abs(relative) > slip, np.sign(relative), 0.0)
+    changed = np.zeros(len(regime), np.int64)
+    changed[1:] = (np.diff(regime, axis=0) != 0.0).any(axis=1)
+    changes = np.cumsum(changed)
+    before = np.concatenate([np.zeros(window, np.int64), changes])[:len(changes)]
+    near: NDArray[np.bool_] = changes > before
     return near
 
 
 def information(scenario: Scenario, states: Array, wheel_speeds: Array
                 ) -> tuple[Array, Array, Array, Array]:
     """
-    Evaluate what a trajectory lets be known, as the filter has it.
+    Evaluate the information about the states along a trajectory, by the model of the filter.
 
     :param states: (steps, 10) true angles and rates of the links, and disturbance torques.
     :param wheel_speeds: (steps, 4) true, relative to the links [rad/s].
@@ -170,7 +122,7 @@ def information(scenario: Scenario, states: Array, wheel_speeds: Array
     steps, kept = len(states), np.ix_(KEPT, KEPT)
     transitions, noises = np.empty((steps - 1, 6, 6)), np.empty((steps - 1, 6, 6))
     seen = np.zeros((steps, 6, 6))
-    # Independent of each other, so the share that is not lost is what they tell on the mean.
+    # Losses are independent, so the mean information is the share that is not lost.
     weight = (1.0 - scenario.table.link_sensors.dropout) / settings.angle_variance
     for n, state in enumerate(states):
         gamma = gamma_matrix(state[:4], mechanism.constants.lengths)
@@ -185,17 +137,17 @@ def information(scenario: Scenario, states: Array, wheel_speeds: Array
     return carried, crossed, driven, seen
 
 
-def bound_of(scenario: Scenario, tally: Tally) -> Array:
+def bound_of(scenario: Scenario, sums: RunSums) -> Array:
     """
-    Evaluate the bound of the mean square errors: (steps, 6, 6), NaN before there is any.
+    Return the bound of the mean square errors (steps, 6, 6), NaN before the first one.
 
-    It begins where the filter does, at the first measurement.
+    It starts like the filter, at the first measurement.
     """
     settings = scenario.estimator
     start = np.diag(1.0 / np.repeat([
         INITIAL_ANGLE_SIGMA ** 2, INITIAL_RATE_SIGMA ** 2,
         WALKED_BEFORE * settings.disturbance_walk ** 2], 2))
     late = ceil(scenario.table.link_sensors.latency * scenario.plant.rate - 1e-6)
-    carried, crossed, driven, seen = (sums / tally.runs for sums in (
-        tally.carried, tally.crossed, tally.driven, tally.seen))
+    carried, crossed, driven, seen = (each / sums.runs for each in (
+        sums.carried, sums.crossed, sums.driven, sums.seen))
     return posterior_bound(start, carried, crossed, driven, seen, late)

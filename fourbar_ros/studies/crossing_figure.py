@@ -1,29 +1,27 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The figure of the crossing study: who passes, how, and where nobody does."""
+"""Figure of the crossing study: shares of runs that pass, paths of eta, and the map."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-import io
+from collections.abc import Iterable, Mapping
 from typing import cast
 
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plotting import style
 from fourbar_ros.plotting.style import COLOURS, LINK_COLOURS
-from fourbar_ros.studies.crossing import (
-    CROSSINGS,
+from fourbar_ros.studies.crossing_runs import (
+    CrossingStatistics,
+    MANOEUVRES,
+    Map,
+    METHODS,
     MISMATCHES,
     stiffness_text,
     STIFFNESSES,
     success,
-    Tally,
     TIMES,
-    TITLES,
 )
-from fourbar_ros.studies.crossing_runs import METHODS
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure, SubFigure
@@ -32,41 +30,31 @@ import numpy as np
 SHORT = {'motion': 'crossing in motion', 'parking': 'parking and turning there',
          'mismatch': 'slow, mismatch 1e-3, 1e4 N/m'}
 METHOD_COLOURS = dict(zip(METHODS, LINK_COLOURS))
-# Paths of so many runs of each kind are drawn.
+# Number of paths drawn of each kind.
 PATHS = 12
-# Of eta: linear up to the first, logarithmic up to the other [deg].
+# Ends of the linear and of the logarithmic range of the axis of eta [deg].
 LINEAR, LARGEST = 0.1, 180.0
 ETA_TICKS = (-100.0, -10.0, -1.0, -0.1, 0.0, 0.1, 1.0, 10.0, 100.0)
-DPI = 110
-
-Map = dict[tuple[float, float, float], Tally]
 
 
-def png(counted: dict[tuple[str, str], Tally], of_map: Map) -> bytes:
-    """Draw shares that pass with their confidence, eta along the way, and the map."""
-    with rc_context(style.RC):
-        buffer = io.BytesIO()
-        _draw(counted, of_map).savefig(
-            buffer, format='png', dpi=DPI, facecolor=COLOURS['paper'])
-        return buffer.getvalue()
-
-
-def _draw(counted: dict[tuple[str, str], Tally], of_map: Map) -> Figure:
+@style.as_png
+def png(by_kind: Mapping[tuple[str, str], CrossingStatistics], of_map: Map) -> Figure:
+    """Draw shares that pass with their confidence intervals, paths of eta, and the map."""
     figure = Figure(figsize=(style.WIDTH_IN, 11.0), layout='constrained')
     shares, paths, maps = cast(Iterable[SubFigure], figure.subfigures(
         3, 1, height_ratios=(1.0, 1.15, 1.15), hspace=0.04))
     for part, title in ((shares, 'Runs that passed, with their 95 % confidence'),
-                        (paths, 'How far opposite links turn apart on the way'),
-                        (maps, f'Slow crossing of 40 deg, {TITLES["four_held"]}: passed [%]')):
+                        (paths, 'Angle between opposite links during the manoeuvre'),
+                        (maps, f'Slow crossing of 40 deg, {METHODS["four_held"]}: passed [%]')):
         part.suptitle(title, x=0.01, ha='left', fontsize=10.5, fontweight='bold')
-    row = shares.subplots(1, len(CROSSINGS), sharey=True)
-    for axes, name in zip(row, CROSSINGS):
-        _shares(axes, {method: counted[name, method] for method in METHODS})
+    row = shares.subplots(1, len(MANOEUVRES), sharey=True)
+    for axes, name in zip(row, MANOEUVRES):
+        _shares(axes, {method: by_kind[name, method] for method in METHODS})
         axes.set_title(SHORT[name])
     row[0].set_ylabel('passed [%]')
-    row = paths.subplots(1, len(CROSSINGS), sharey=True)
-    for axes, name in zip(row, CROSSINGS):
-        _paths(axes, {method: counted[name, method] for method in METHODS})
+    row = paths.subplots(1, len(MANOEUVRES), sharey=True)
+    for axes, name in zip(row, MANOEUVRES):
+        _paths(axes, {method: by_kind[name, method] for method in METHODS})
         axes.set_title(SHORT[name])
     row[0].set_ylabel(r'$\eta = \phi_c - \phi_a$ [deg]')
     handles, labels = row[0].get_legend_handles_labels()
@@ -83,31 +71,31 @@ def _draw(counted: dict[tuple[str, str], Tally], of_map: Map) -> Figure:
     return figure
 
 
-def _shares(axes: Axes, tallies: dict[str, Tally]) -> None:
-    for place, (method, tally) in enumerate(tallies.items()):
-        share = 100.0 * tally.passed / tally.runs
-        low, high = (100.0 * bound for bound in tally.interval)
+def _shares(axes: Axes, statistics: dict[str, CrossingStatistics]) -> None:
+    for place, (method, each) in enumerate(statistics.items()):
+        share = 100.0 * each.passed / each.runs
+        low, high = (100.0 * bound for bound in each.interval)
         axes.bar(place, share, color=METHOD_COLOURS[method], width=0.6)
         axes.errorbar(place, share, yerr=[[share - low], [high - share]], color=COLOURS['ink'],
                       capsize=3.0, linewidth=1.0)
-        axes.annotate(f'{tally.passed} of {tally.runs}', (place, high), (0.0, 4.0),
+        axes.annotate(f'{each.passed} of {each.runs}', (place, high), (0.0, 4.0),
                       textcoords='offset points', ha='center', fontsize=8.0)
-    axes.set_xticks(range(len(tallies)), [TITLES[method].replace(', ', ',\n')
-                                          for method in tallies])
-    axes.set_xlim(-0.6, len(tallies) - 0.4)
+    axes.set_xticks(range(len(statistics)), [METHODS[method].replace(', ', ',\n')
+                                          for method in statistics])
+    axes.set_xlim(-0.6, len(statistics) - 0.4)
     axes.set_ylim(0.0, 115.0)
     axes.set_yticks(range(0, 101, 20))
     axes.grid(axis='x', visible=False)
 
 
-def _paths(axes: Axes, tallies: dict[str, Tally]) -> None:
-    # Those that fail lie beneath.
-    for method, tally in reversed(tallies.items()):
-        for number, passage in enumerate(tally.passages[:PATHS]):
-            axes.plot(*_unbroken(np.degrees(passage.path)), color=METHOD_COLOURS[method],
-                      linewidth=0.8, alpha=0.7, label=None if number else TITLES[method])
+def _paths(axes: Axes, statistics: dict[str, CrossingStatistics]) -> None:
+    # Paths of methods that fail lie beneath the others.
+    for method, each in reversed(statistics.items()):
+        for number, outcome in enumerate(each.outcomes[:PATHS]):
+            axes.plot(*_unbroken(np.degrees(outcome.path)), color=METHOD_COLOURS[method],
+                      linewidth=0.8, alpha=0.7, label=None if number else METHODS[method])
     axes.set_xlabel(r'$\theta = \phi_b - \phi_a$ [deg]')
-    # All that passes is small, all that fails is large.
+    # Paths that pass are small, paths that fail are large.
     axes.set_yscale('symlog', linthresh=LINEAR, linscale=0.5)
     axes.set_ylim(-LARGEST, LARGEST)
     axes.set_yticks(ETA_TICKS,

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Whether an estimator knows how well it knows: the statistics, apart from what is estimated.
+Statistics of the consistency of an estimator: NEES, NIS, whiteness, Cramer-Rao bound.
 
-After Y. Bar-Shalom, X.-R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
+Y. Bar-Shalom, X.-R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
 Navigation, Wiley 2001, section 5.4.
 """
 
@@ -20,7 +20,7 @@ CONFIDENCE = 0.95
 
 def normalised_squares(errors: Array, covariances: Array) -> Array:
     """
-    Evaluate e' P^-1 e: chi-square of n degrees of freedom where the covariance is the errors'.
+    Evaluate e' P^-1 e: chi-square with n degrees of freedom if P is the covariance of e.
 
     :param errors: (..., n).
     :param covariances: (..., n, n).
@@ -33,7 +33,7 @@ def normalised_squares(errors: Array, covariances: Array) -> Array:
 
 def chi_square_bounds(degrees: ArrayLike, confidence: float = CONFIDENCE) -> tuple[Array, Array]:
     """
-    Return between which values a chi-square lies with a probability, its tails alike.
+    Return the central interval of a chi-square distribution.
 
     :param degrees: of freedom, any shape; the sum over independent runs has the sum of theirs.
     :returns: lower and upper bound, in that shape; NaN for no degrees of freedom.
@@ -46,7 +46,7 @@ def chi_square_bounds(degrees: ArrayLike, confidence: float = CONFIDENCE) -> tup
 
 
 def share_inside(values: Array, low: Array, high: Array) -> float:
-    """Return the share of the values from low to high, those that have no bounds left out."""
+    """Return the share of the values from low to high; values without bounds are ignored."""
     known = np.isfinite(low) & np.isfinite(high) & np.isfinite(values)
     if not known.any():
         return float('nan')
@@ -55,13 +55,13 @@ def share_inside(values: Array, low: Array, high: Array) -> float:
 
 def lagged_products(innovations: Array, lags: int) -> tuple[Array, NDArray[np.int64]]:
     """
-    Sum up products of a sensor's normalised innovations with its later ones.
+    Sum the products of a sensor's normalised innovations with later ones.
 
-    Sums and numbers of several runs may be added before they are divided.
+    The sums and counts of several runs may be added before the division.
 
-    :param innovations: (steps, sensors), NaN where there was none: then a product is left out.
-    :param lags: the largest.
-    :returns: sums and their numbers of products, (lags + 1, sensors), from lag 0 on.
+    :param innovations: (steps, sensors), NaN without a sample; its products are left out.
+    :param lags: largest lag.
+    :returns: sums and numbers of products, (lags + 1, sensors), from lag 0 on.
     """
     known = np.isfinite(innovations)
     values = np.where(known, innovations, 0.0)
@@ -76,14 +76,14 @@ def lagged_products(innovations: Array, lags: int) -> tuple[Array, NDArray[np.in
 def autocorrelation(sums: Array, counts: NDArray[np.int64], confidence: float = CONFIDENCE
                     ) -> tuple[Array, Array]:
     """
-    Divide what :func:`lagged_products` summed up, and say how large it is by chance.
+    Return the autocorrelation from the sums of :func:`lagged_products`, and its bound.
 
-    Of white innovations the products at a lag have the mean 0, and are uncorrelated: their mean
-    over N pairs has the variance 1 / N, in units of the square at lag 0. A lost sample takes
-    away pairs and nothing else.
+    For white innovations the products at a lag have mean 0 and are uncorrelated: their mean over
+    N pairs has the variance 1 / N, in units of the square at lag 0. A lost sample only reduces the
+    number of pairs.
 
-    :returns: autocorrelation at lags 1 to n, (lags, sensors), and the bound that its size keeps
-        with the given probability, in that shape. NaN without a pair.
+    :returns: autocorrelation at lags 1 to n, (lags, sensors), and the bound of its absolute value
+        for white innovations at this confidence, in that shape. NaN without a pair.
     """
     with np.errstate(invalid='ignore', divide='ignore'):
         means = sums / counts
@@ -105,14 +105,14 @@ def posterior_bound(start: Array, carried: Array, crossed: Array, driven: Array,
 
         J(k + 1) = D22 - D12' (J(k) + D11)^-1 D12 .
 
-    What is measured may be known some steps later only; then J is carried on without.
+    With delayed measurements J is predicted over the delay.
 
     :param start: (n, n) information before the first measurement, the inverse of the prior.
     :param carried: (steps - 1, n, n) E[F' Q^-1 F] from each step to the next.
     :param crossed: (steps - 1, n, n) E[F' Q^-1].
     :param driven: (steps - 1, n, n) E[Q^-1].
     :param seen: (steps, n, n) E[H' R^-1 H] at each step.
-    :param late: after how many steps a measurement is known.
+    :param late: delay of the measurements [steps].
     :returns: (steps, n, n) covariances, NaN for steps without a measurement so far.
     """
     steps = len(seen)
@@ -129,8 +129,8 @@ def posterior_bound(start: Array, carried: Array, crossed: Array, driven: Array,
 
 
 def _carry(information: Array, step: int, carried: Array, crossed: Array, driven: Array) -> Array:
-    """Evaluate what is known at the next step of what is known at this one."""
-    given = np.linalg.solve(information + carried[step], crossed[step])
-    after = driven[step] - crossed[step].T @ given
-    symmetric: Array = 0.5 * (after + after.T)
+    """Predict the information by one step."""
+    gain = np.linalg.solve(information + carried[step], crossed[step])
+    predicted = driven[step] - crossed[step].T @ gain
+    symmetric: Array = 0.5 * (predicted + predicted.T)
     return symmetric

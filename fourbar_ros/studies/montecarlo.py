@@ -42,6 +42,7 @@ from fourbar_ros.studies.campaigns.campaign_summary import (
     statistics,
 )
 from fourbar_ros.studies.campaigns.cluster import ClusterWorkers
+from fourbar_ros.studies.campaigns.parameter_names import MODEL, MODEL_NAMES
 from fourbar_ros.studies.campaigns.result_folder import ResultFolder
 from fourbar_ros.studies.campaigns.workers import completed, completed_locally
 import numpy as np
@@ -49,10 +50,10 @@ import pyarrow as pa
 from scipy.stats import binomtest
 import yaml
 
+# Work in a batch of runs, and an estimate of the work of a tick [s].
 BATCH_TIME, TICK_TIME = 2.0, 3e-4
-"""Work in a batch of runs, and an estimate of the work of a tick [s]."""
+# Largest number of runs in a batch; their rows are stored together.
 MOST_IN_BATCH = 32
-"""Largest number of runs in a batch; their rows are stored together."""
 PRINTED_CORRELATIONS = 10
 
 
@@ -135,7 +136,9 @@ def _repeat(campaign: Campaign, run: int) -> Result:
     row = execute_run(campaign, run)
     wall = row.pop(WALL)
     text = '\n'.join([f'{name:<44}{_cell(value)}' for name, value in row.items()])
-    scenario = yaml.safe_dump(campaign.described(run), sort_keys=False)
+    scenario = yaml.safe_dump({
+        MODEL_NAMES[0] if key == MODEL else key: value
+        for key, value in campaign.described(run).items()}, sort_keys=False)
     return Result([], {'row': row, WALL: wall}, text, {f'run_{run}.yaml': scenario},
                   document=f'run_{run}.json')
 

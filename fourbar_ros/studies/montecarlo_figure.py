@@ -1,13 +1,13 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The figures of a campaign: how the metrics spread, and what they depend on."""
+"""Figures of a campaign: histograms of the metrics, and the strongest correlations."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-import io
+from collections.abc import Mapping, Sequence
 from math import ceil
+from typing import Any
 
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plotting import style
@@ -16,7 +16,6 @@ from fourbar_ros.studies.campaigns.campaign import Limit
 from fourbar_ros.studies.campaigns.campaign_run import METRICS
 from fourbar_ros.studies.campaigns.campaign_summary import Correlation, Statistics
 from fourbar_ros.studies.campaigns.distributions import Parameter
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -37,59 +36,52 @@ MAIN = ('tracking_rms_rad', 'final_error_rad', 'estimate_rms_rad', 'nees_per_deg
 HOW = {'': '', 'scale': ', times nominal', 'add': ', added'}
 COLUMNS, PANELS = 3, 6
 BINS = 30
-DPI = 110
-# Weaker ones are not worth a picture.
+SUPTITLE: Any = {'x': 0.01, 'ha': 'left', 'fontsize': 10.5, 'fontweight': 'bold'}
+# Correlations of a smaller size are not drawn.
 LEAST_RHO = 0.1
 
 
-def distributions_png(metrics: Mapping[str, Array], described: Mapping[str, Statistics],
-                      limits: Sequence[Limit], failed: int) -> bytes:
+@style.as_png
+def distributions_png(metrics: Mapping[str, Array], summary: Mapping[str, Statistics],
+                      limits: Sequence[Limit], failed: int) -> Figure:
     """
     Draw a histogram of each main metric, with its quantiles and the limits of the campaign.
 
-    :param metrics: (runs,) by name, NaN for none.
+    :param metrics: (runs,) by name, NaN where undefined.
     """
-    def draw() -> Figure:
-        figure = Figure(figsize=(style.WIDTH_IN, 6.0), layout='constrained')
-        axes = np.ravel(figure.subplots(ceil(len(MAIN) / COLUMNS), COLUMNS))
-        for panel, name in zip(axes, MAIN):
-            _histogram(panel, name, metrics[name], described[name],
-                       [limit for limit in limits if limit.metric == name])
-        for row in range(0, len(MAIN), COLUMNS):
-            axes[row].set_ylabel('runs')
-        runs = len(next(iter(metrics.values())))
-        figure.suptitle(f'{runs} runs, {failed} failed', x=0.01, ha='left', fontsize=10.5,
-                        fontweight='bold')
-        return figure
-    return _png(draw)
+    figure, panels = style.panels(6.0, ceil(len(MAIN) / COLUMNS), COLUMNS)
+    for panel, name in zip(np.ravel(panels), MAIN):
+        _histogram(panel, name, metrics[name], summary[name],
+                   [limit for limit in limits if limit.metric == name])
+    for row in panels:
+        row[0].set_ylabel('runs')
+    runs = len(next(iter(metrics.values())))
+    figure.suptitle(f'{runs} runs, {failed} failed', **SUPTITLE)
+    return figure
 
 
+@style.as_png
 def scatter_png(parameters: Sequence[Parameter], drawn: Mapping[str, Array],
-                metrics: Mapping[str, Array], strongest: Sequence[Correlation]) -> bytes:
+                metrics: Mapping[str, Array], strongest: Sequence[Correlation]) -> Figure:
     """
-    Draw the strongest correlations, of each main metric at most two.
+    Draw the strongest correlations, at most two of each main metric.
 
-    :param parameters: that are drawn.
-    :param drawn, metrics: (runs,) by name, NaN for none.
-    :param strongest: in this order.
+    :param parameters: that vary.
+    :param drawn, metrics: (runs,) by name, NaN where undefined.
+    :param strongest: correlations in this order.
     """
     labels = {name: name + HOW[parameter.distribution.how] for parameter in parameters
               for name in parameter.columns}
-
-    def draw() -> Figure:
-        shown = _shown(strongest)
-        rows = ceil(len(shown) / COLUMNS)
-        figure = Figure(figsize=(style.WIDTH_IN, 0.4 + 2.9 * rows), layout='constrained')
-        axes = np.ravel(figure.subplots(rows, COLUMNS))
-        for panel, each in zip(axes, shown):
-            _scatter(panel, each, drawn[each.parameter], metrics[each.metric])
-            panel.set_xlabel(labels[each.parameter], fontsize=8.0)
-        for panel in axes[len(shown):]:
-            panel.set_visible(False)
-        figure.suptitle('What the runs depend on most', x=0.01, ha='left', fontsize=10.5,
-                        fontweight='bold')
-        return figure
-    return _png(draw)
+    shown = _shown(strongest)
+    rows = ceil(len(shown) / COLUMNS)
+    figure, panels = style.panels(0.4 + 2.9 * rows, rows, COLUMNS, squeeze=False)
+    for panel, each in zip(panels.flat, shown):
+        _scatter(panel, each, drawn[each.parameter], metrics[each.metric])
+        panel.set_xlabel(labels[each.parameter], fontsize=8.0)
+    for panel in panels.flat[len(shown):]:
+        panel.set_visible(False)
+    figure.suptitle('Strongest dependences of the metrics', **SUPTITLE)
+    return figure
 
 
 def _shown(strongest: Sequence[Correlation]) -> list[Correlation]:
@@ -102,10 +94,10 @@ def _shown(strongest: Sequence[Correlation]) -> list[Correlation]:
     return found or list(strongest[:1])
 
 
-def _histogram(axes: Axes, name: str, values: Array, found: Statistics, limits: Sequence[Limit]
-               ) -> None:
+def _histogram(axes: Axes, name: str, values: Array, statistics: Statistics,
+               limits: Sequence[Limit]) -> None:
     axes.set_title(TITLES[name])
-    if not found.n:
+    if not statistics.n:
         axes.annotate('in no run', (0.5, 0.5), xycoords='axes fraction', ha='center',
                       color=COLOURS['muted'])
         axes.set_xticks([])
@@ -113,11 +105,12 @@ def _histogram(axes: Axes, name: str, values: Array, found: Statistics, limits: 
         return
     factor, unit = _scale(name, values)
     known = factor * values[np.isfinite(values)]
-    axes.hist(known, bins=max(5, min(BINS, round(2.0 * found.n ** 0.5))),
+    axes.hist(known, bins=max(5, min(BINS, round(2.0 * statistics.n ** 0.5))),
               color=LINK_COLOURS[0], alpha=0.75, edgecolor=COLOURS['paper'], linewidth=0.5)
     top = axes.get_ylim()[1]
     axes.set_ylim(0.0, 1.22 * top)
-    for value, text, dash in zip(found.quantiles, ('5 %', 'median', '95 %'), ('--', '-', '--')):
+    for value, text, dash in zip(
+            statistics.quantiles, ('5 %', 'median', '95 %'), ('--', '-', '--')):
         axes.axvline(factor * value, ymax=0.85, color=COLOURS['ink'], linewidth=1.0,
                      linestyle=dash)
         axes.annotate(text, (factor * value, 0.87), xycoords=('data', 'axes fraction'),
@@ -131,7 +124,7 @@ def _histogram(axes: Axes, name: str, values: Array, found: Statistics, limits: 
         text, inside = f'limit of {of}: {factor * bound:.3g}', low < factor * bound < high
         if inside:
             axes.axvline(factor * bound, ymax=0.85, color=COLOURS['limit'], linewidth=1.2)
-        # One far off would leave the histogram no room.
+        # A limit outside the axis would compress the histogram.
         if factor * bound >= high:
             text += ' \N{RIGHTWARDS ARROW}'
         elif not inside:
@@ -153,7 +146,7 @@ def _scatter(axes: Axes, correlation: Correlation, drawn: Array, values: Array) 
 
 
 def _scale(name: str, values: Array) -> tuple[float, str]:
-    """Return a factor and a unit in which the values read well."""
+    """Return a factor and a unit that give short numbers."""
     unit = METRICS[name].unit
     largest = float(np.nanmax(np.abs(values), initial=0.0))
     if unit == 'rad':
@@ -162,10 +155,3 @@ def _scale(name: str, values: Array) -> tuple[float, str]:
         return 1.0, unit
     factor, prefix = style.si_scale(largest)
     return factor, prefix + unit
-
-
-def _png(draw: Callable[[], Figure]) -> bytes:
-    with rc_context(style.RC):
-        buffer = io.BytesIO()
-        draw().savefig(buffer, format='png', dpi=DPI, facecolor=COLOURS['paper'])
-        return buffer.getvalue()

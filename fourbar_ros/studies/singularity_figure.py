@@ -1,29 +1,26 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The figure of the study of the collapsed linkage: who holds it, who drives what, and parking."""
+"""Figure of the collapsed linkage: closure, stiffness, generalized forces, ranks, and parking."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-import io
 
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plotting import style
 from fourbar_ros.plotting.style import COLOURS, LINK_COLOURS
-from fourbar_ros.studies.crossing_runs import Passage
-from fourbar_ros.studies.singularity import (
+from fourbar_ros.studies.crossing_runs import CrossingOutcome, STIFFNESS
+from fourbar_ros.studies.singularity_model import (
     DRIVES,
     joint_motor,
     LOCKS,
     MODES,
     PARKING,
     RANKS,
-    STIFFNESS,
     TITLES,
     wheel_motor,
 )
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
@@ -31,23 +28,19 @@ from matplotlib.patches import Arc
 import numpy as np
 
 JOINTS, WHEELS = LINK_COLOURS[1], LINK_COLOURS[0]
-DPI = 120
 
 
-def png(numbers: Mapping[str, Array], parked: Mapping[str, Passage]) -> bytes:
+@style.as_png
+def png(numbers: Mapping[str, Array], parked: Mapping[str, CrossingOutcome]) -> Figure:
     """Draw the locked linkage, stiffness, closure, generalized forces, ranks, and parking."""
-    with rc_context(style.RC):
-        figure = Figure(figsize=(style.WIDTH_IN, 7.0), layout='constrained')
-        panels = figure.subplots(2, 3)
-        _sketch(panels[0, 0])
-        _closure(panels[0, 1], numbers)
-        _stiffness(panels[0, 2], numbers)
-        _forces(panels[1, 0])
-        _ranks(panels[1, 1])
-        _parking(panels[1, 2], parked)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format='png', dpi=DPI, facecolor=COLOURS['paper'])
-        return buffer.getvalue()
+    figure, panels = style.panels(7.0, 2, 3)
+    _sketch(panels[0, 0])
+    _closure(panels[0, 1], numbers)
+    _stiffness(panels[0, 2], numbers)
+    _forces(panels[1, 0])
+    _ranks(panels[1, 1])
+    _parking(panels[1, 2], parked)
+    return figure
 
 
 def _sketch(axes: Axes) -> None:
@@ -153,7 +146,7 @@ def _ranks(axes: Axes) -> None:
     axes.grid(axis='y', visible=False)
 
 
-def _parking(axes: Axes, parked: Mapping[str, Passage]) -> None:
+def _parking(axes: Axes, parked: Mapping[str, CrossingOutcome]) -> None:
     for method, label, colour in (('two', 'two wheels', JOINTS),
                                   ('four_held', r'four, $\eta$ fed back', WHEELS)):
         eta = np.abs(np.degrees(parked[method].path[:, 1]))

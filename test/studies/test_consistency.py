@@ -10,8 +10,8 @@ from fourbar_ros.estimation import filter as estimation_filter
 from fourbar_ros.loop import load_scenario, run_scenario, Scenario
 from fourbar_ros.plant import plant as plant_module
 from fourbar_ros.studies import consistency
-from fourbar_ros.studies.consistency import Case, Outcome
-from fourbar_ros.studies.consistency_runs import bound_of, follow, near_reversals
+from fourbar_ros.studies.consistency_results import CaseResult, ConsistencyCase
+from fourbar_ros.studies.consistency_runs import bound_of, execute, near_reversals
 from fourbar_ros.studies.estimator_statistics import (
     autocorrelation,
     chi_square_bounds,
@@ -131,7 +131,7 @@ def test_bound_of_a_linear_system_is_the_covariance_of_its_kalman_filter(late: i
 
 
 @pytest.mark.parametrize('matched', [True, False])
-def test_bound_is_what_the_filter_says_of_itself_where_nothing_is_lost(
+def test_bound_equals_the_covariance_of_the_filter_without_losses(
     matched: bool, scenario: Scenario,
 ) -> None:
     """
@@ -145,7 +145,7 @@ def test_bound_is_what_the_filter_says_of_itself_where_nothing_is_lost(
         sensors = replace(scenario.table.link_sensors, dropout=0.0)
         scenario = replace(scenario, table=replace(scenario.table, link_sensors=sensors))
     scenario = replace(scenario, duration=0.8)
-    bound = bound_of(scenario, follow(scenario))
+    bound = bound_of(scenario, execute(scenario))
     said = [step.estimate for step in run_scenario(scenario)]
     assert [estimate is None for estimate in said] == np.isnan(bound[:, 0, 0]).tolist()
     for n in (10, 50, 200):
@@ -155,7 +155,7 @@ def test_bound_is_what_the_filter_says_of_itself_where_nothing_is_lost(
         np.testing.assert_allclose(np.sqrt(bound[n].diagonal()[:4]), sigmas, rtol=0.01)
 
 
-def test_reversal_is_a_joint_that_slides_another_way_or_not_at_all() -> None:
+def test_reversal_is_a_change_of_the_friction_regime() -> None:
     """Joint 1 sticks and creeps to and fro, slides, turns around, and joint 4 comes along."""
     rates = np.zeros((14, 4))
     rates[:, 1] = [1e-5, -1e-5, 1e-5, 1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0, 0.0]
@@ -166,7 +166,7 @@ def test_reversal_is_a_joint_that_slides_another_way_or_not_at_all() -> None:
     assert np.flatnonzero(near).tolist() == [3, 4, 8, 9, 13]
 
 
-def test_matched_table_does_what_the_filter_believes(scenario: Scenario) -> None:
+def test_matched_table_follows_the_model_of_the_filter(scenario: Scenario) -> None:
     made = consistency.matched(scenario, 0)
     table, settings = made.table, made.estimator
     assert (table.disturbance.torque_density, table.disturbance.torque_walk) == (
@@ -181,18 +181,19 @@ def test_matched_table_does_what_the_filter_believes(scenario: Scenario) -> None
             table.surface.tilt_x) == (0.0, 0.0, 0.0, 0.0)
 
 
-def test_filter_that_is_too_sure_of_itself_is_missed(scenario: Scenario) -> None:
-    """Torques that walk ten times as fast as it believes; over two runs of 1.5 s."""
+def test_overconfident_filter_misses_the_checks(scenario: Scenario) -> None:
+    """The random-walk torques are ten times the assumed ones, over two runs of 1.5 s."""
     made = replace(consistency.matched(scenario, 0), duration=1.5)
     wild = replace(made, table=replace(made.table, disturbance=replace(
         made.table.disturbance, torque_walk=10.0 * made.table.disturbance.torque_walk)))
-    verdicts = {}
+    passed = {}
     for name, case in (('right', made), ('wrong', wild)):
-        tally = follow(case) + follow(replace(case, seed=1))
-        outcome = Outcome(Case('matched', 'matched', case), tally)
-        verdicts[name] = {check.name: check.passed for check in consistency.checks([outcome])}
+        sums = execute(case) + execute(replace(case, seed=1))
+        outcome = CaseResult(
+            ConsistencyCase('matched', 'matched', case), sums, bound_of(case, sums))
+        passed[name] = {check.name: check.passed for check in consistency.checks([outcome])}
         assert (outcome.mean_nees > 10.0) == (name == 'wrong')
-    assert verdicts['right']['matched, steps with NEES in its 95 % bounds']
-    assert not verdicts['wrong']['matched, steps with NEES in its 95 % bounds']
-    assert not verdicts['wrong']['matched, rms error / bound, phi_a']
-    assert verdicts['wrong']['matched, runs in which a sensor was named faulty']
+    assert passed['right']['matched, steps with NEES in its 95 % bounds']
+    assert not passed['wrong']['matched, steps with NEES in its 95 % bounds']
+    assert not passed['wrong']['matched, rms error / bound, phi_a']
+    assert passed['wrong']['matched, runs in which a sensor was named faulty']

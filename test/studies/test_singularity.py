@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The collapsed linkage: what moves when a joint is locked, who drives what, what holds it."""
+"""The collapsed linkage: admissible motions, generalized forces of drives, and stiffness."""
 
 import csv
 from io import BytesIO, StringIO
@@ -9,15 +9,16 @@ from io import BytesIO, StringIO
 from fourbar_ros.mechanism import closure_error, joint_positions, load_mechanism
 from fourbar_ros.mechanism.forces import NOTHING, surroundings
 from fourbar_ros.mechanism.mechanism import JOINT_LINKS
-from fourbar_ros.studies import load_study, Result, singularity
-from fourbar_ros.studies.singularity import (
+from fourbar_ros.studies import load_study, Result, singularity_model
+from fourbar_ros.studies.crossing_runs import STIFFNESS
+from fourbar_ros.studies.singularity_model import (
     AWAY,
     closure_jacobian,
-    driven,
-    driven_apart,
     DRIVES,
     ETA,
     eta_inertia,
+    generalized_forces,
+    integrate_eta,
     joint_force,
     joint_motor,
     LOCKS,
@@ -25,7 +26,6 @@ from fourbar_ros.studies.singularity import (
     motions,
     output_stiffness,
     rank,
-    STIFFNESS,
     wheel_motor,
 )
 import numpy as np
@@ -96,18 +96,18 @@ def test_no_joint_motor_turns_the_whole_and_one_alone_drives_one_motion() -> Non
     for theta in (0.0, 0.2, AWAY):
         for joint in range(4):
             assert whole @ joint_motor(joint) == 0.0
-            assert rank(driven(PROTOTYPE, theta, joint_motor(joint)[:, None])) == 1
+            assert rank(generalized_forces(PROTOTYPE, theta, joint_motor(joint)[:, None])) == 1
         # All of them together never do what four wheels do.
-        assert rank(driven(PROTOTYPE, theta, DRIVES['four_joints'])) < rank(
-            driven(PROTOTYPE, theta, DRIVES['four_wheels']))
+        assert rank(generalized_forces(PROTOTYPE, theta, DRIVES['four_joints'])) < rank(
+            generalized_forces(PROTOTYPE, theta, DRIVES['four_wheels']))
 
 
 def test_four_wheels_drive_every_motion_alike_and_two_miss_one() -> None:
     for theta in (-AWAY, -1e-3, 0.0, 1e-9, 0.3):
         gains = np.linalg.svd(
-            driven(PROTOTYPE, theta, DRIVES['four_wheels']), compute_uv=False)
+            generalized_forces(PROTOTYPE, theta, DRIVES['four_wheels']), compute_uv=False)
         np.testing.assert_allclose(gains, 1.0, atol=1e-12)
-    missed = np.linalg.svd(driven(PROTOTYPE, 0.0, DRIVES['wheels_a_b']))
+    missed = np.linalg.svd(generalized_forces(PROTOTYPE, 0.0, DRIVES['wheels_a_b']))
     left = motions(PROTOTYPE, 0.0) @ missed[0][:, 2]
     # Neither a nor b moves in it: c and d turn.
     np.testing.assert_allclose(left[:2], 0.0, atol=1e-12)
@@ -149,20 +149,20 @@ def test_force_in_the_coupler_balances_the_torque(theta: float) -> None:
 
 
 def test_integrator_follows_opposite_wheels_and_no_joint_motor() -> None:
-    square = 0.5 * singularity.TORQUE * singularity.DRIVEN_FOR ** 2
+    square = 0.5 * singularity_model.TORQUE * singularity_model.PUSH_TIME ** 2
     for shares in ([1.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, -1.0], [0.5, 0.5, -0.5, -0.5]):
-        opened = driven_apart(PROTOTYPE, np.array(shares), NOTHING)
+        opened = integrate_eta(PROTOTYPE, np.array(shares), NOTHING)
         assert opened == pytest.approx(square / eta_inertia(PROTOTYPE, 0.0), rel=1e-8)
     for joint in (0, 2):
-        around = surroundings(link_torques=singularity.TORQUE * joint_motor(joint))
-        assert abs(driven_apart(PROTOTYPE, np.zeros(4), around)) < 1e-12
-    alike = driven_apart(PROTOTYPE, np.array([1.0, 1.0, 1.0, 1.0]), NOTHING)
+        around = surroundings(link_torques=singularity_model.TORQUE * joint_motor(joint))
+        assert abs(integrate_eta(PROTOTYPE, np.zeros(4), around)) < 1e-12
+    alike = integrate_eta(PROTOTYPE, np.array([1.0, 1.0, 1.0, 1.0]), NOTHING)
     assert abs(alike) < 1e-12
 
 
 @pytest.fixture(scope='module')
 def result() -> Result:
-    """Return what the study finds."""
+    """Return the result of the study."""
     return load_study('singularity')(lambda items, count: items)
 
 

@@ -37,12 +37,12 @@ from fourbar_ros.studies.campaigns.parameter_names import (
 from fourbar_ros.studies.campaigns.versions import versions
 import numpy as np
 
+# Name of the share of failed runs among the limits.
 FAILURE_RATE = 'failure_rate'
-"""Name of the share of failed runs among the limits."""
+# Number of runs whose scenarios are checked before the first run starts.
 CHECKED_RUNS = 2000
-"""Number of runs whose scenarios are checked before the first run starts."""
+# Key of the random stream from which a run takes the seed of its noise.
 _NOISE_STREAM = 0x5EED
-"""Key of the random stream from which a run takes the seed of its noise."""
 
 
 @dataclass(frozen=True)

@@ -31,13 +31,13 @@ import numpy as np
 if TYPE_CHECKING:
     from fourbar_ros.studies.campaigns.campaign import Campaign
 
+# Number, seed, drawn values, metrics and failure of a run, by column.
 Row = dict[str, Any]
-"""Number, seed, drawn values, metrics and failure of a run, by column."""
 
+# Length of the interval at the end over which the final error is averaged [s].
 FINAL_WINDOW = 1.0
-"""Length of the interval at the end over which the final error is averaged [s]."""
+# Column of the duration of the computation, the only one that differs between repetitions.
 WALL = 'wall_s'
-"""Column of the duration of the computation, the only one that differs between repetitions."""
 
 
 class MetricDescription(NamedTuple):
@@ -47,6 +47,7 @@ class MetricDescription(NamedTuple):
     definition: str
 
 
+# Every metric by the name of its column.
 METRICS = {
     'tracking_rms_rad': MetricDescription(
         'rad', 'true minus reference angles of links a and b since the first setpoint, rms'),
@@ -71,7 +72,6 @@ METRICS = {
     'eq9_j_s': MetricDescription('J s', 'actuation cost of paper eq. 9, likewise'),
     'speed_margin': MetricDescription('', 'smallest unused share of the speed limit of a wheel'),
 }
-"""Every metric by the name of its column."""
 
 _COSTS = {'work_j': WORK, 'copper_loss_j': COPPER, 'eq9_j_s': EQ9}
 

@@ -16,12 +16,12 @@ from fourbar_ros.studies.campaigns.campaign_run import METRICS
 import numpy as np
 from scipy import stats
 
+# Confidence of all intervals.
 CONFIDENCE = 0.95
-"""Confidence of all intervals."""
+# Quantiles of the metrics that are reported.
 QUANTILES = (0.05, 0.5, 0.95)
-"""Quantiles of the metrics that are reported."""
+# Smallest number of runs for a correlation; with fewer it is not significant.
 FEWEST_RUNS = 5
-"""Smallest number of runs for a correlation; with fewer it is not significant."""
 
 
 @dataclass(frozen=True)

@@ -21,16 +21,16 @@ from fourbar_ros.studies.campaigns import CampaignError
 from fourbar_ros.studies.campaigns.versions import difference
 from fourbar_ros.studies.campaigns.workers import WorkerLostError
 
+# Longest wait for the connection to the scheduler [s].
 CONNECT_TIMEOUT = 5.0
-"""Longest wait for the connection to the scheduler [s]."""
+# Longest wait for the first worker [s].
 FIRST_WORKER_TIMEOUT = 15.0
-"""Longest wait for the first worker [s]."""
+# Longest time without workers after the first one [s].
 NO_WORKER_TIMEOUT = 60.0
-"""Longest time without workers after the first one [s]."""
+# Longest wait for an answer of a scheduler or worker that is connected [s].
 ANSWER_TIMEOUT = 30.0
-"""Longest wait for an answer of a scheduler or worker that is connected [s]."""
+# Batches submitted at a time per thread of the workers; hides the latency of the network.
 BATCHES_PER_THREAD = 3
-"""Batches submitted at a time per thread of the workers; hides the latency of the network."""
 # In Python 3.10 asyncio's error, which Dask raises, is a type of its own.
 _TIMED_OUT = (TimeoutError, asyncio.TimeoutError)
 

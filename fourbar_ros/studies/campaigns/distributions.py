@@ -25,6 +25,7 @@ from fourbar_ros.studies.campaigns.parameter_names import Place, suggestion
 import numpy as np
 from scipy import stats
 
+# Distributions and the syntax of their arguments.
 KINDS = {
     'uniform': '[low, high]',
     'normal': '{mean, std}',
@@ -33,12 +34,11 @@ KINDS = {
     'choice': '[value, value, ...]',
     'grid': '[value, value, ...], each with each of the other grids',
 }
-"""Distributions and the syntax of their arguments."""
 
+# Smallest probability of the range `within`; a smaller one is taken for a mistake.
 LEAST_SHARE = 1e-3
-"""Smallest probability of the range `within`; a smaller one is taken for a mistake."""
+# Draws per run; with `LEAST_SHARE` all of them miss the range in one of 1e43 runs.
 MOST_DRAWS = 100_000
-"""Draws per run; with `LEAST_SHARE` all of them miss the range in one of 1e43 runs."""
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,15 @@ from typing import Any
 
 from fourbar_ros.studies.campaigns import CampaignError
 
+# Keys and indices on the path to a value.
 Place = tuple[str | int, ...]
-"""Keys and indices on the path to a value."""
 
+# Key of the mechanism that estimator and controller assume, in the description of a scenario.
 MODEL = 'believed'
-"""Key of the mechanism that estimator and controller assume, in the description of a scenario."""
+# Its names in campaign files; the second one is deprecated.
 MODEL_NAMES = ('model', 'believed')
-"""Its names in campaign files; the second one is deprecated."""
+# Keys that each run sets by itself.
 NOT_VARIED = ('seed',)
-"""Keys that each run sets by itself."""
 
 _LETTERS = 'abcd'
 _STEPS = re.compile(r'(?:^|\.)([A-Za-z_]\w*)|\[(\d+)\]')

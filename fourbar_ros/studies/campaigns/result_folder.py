@@ -30,8 +30,8 @@ import pyarrow as pa
 from pyarrow import parquet
 
 IDENTITY, PARTS, RUNS = 'campaign.json', 'parts', 'runs.parquet'
+# Number of part files above which they are merged.
 MOST_PARTS = 200
-"""Number of part files above which they are merged."""
 _TYPES = {float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 
 

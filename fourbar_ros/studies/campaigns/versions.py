@@ -14,12 +14,12 @@ import platform
 
 import fourbar_ros
 
+# Rooms that a closed loop without ROS consists of.
 ROOMS = ('common', 'control', 'device', 'estimation', 'kernels', 'loop', 'mechanism', 'plant')
-"""Rooms that a closed loop without ROS consists of."""
+# Modules that draw its parameters and compute its metrics.
 MODULES = ('studies/campaigns/campaign.py', 'studies/campaigns/campaign_run.py',
            'studies/campaigns/distributions.py', 'studies/campaigns/parameter_names.py',
            'studies/estimator_statistics.py')
-"""Modules that draw its parameters and compute its metrics."""
 LIBRARIES = ('numpy', 'scipy', 'numba', 'filterpy')
 
 

@@ -5,9 +5,9 @@
 Independent runs on worker processes: of this machine, or of a Dask cluster.
 
 `completed` distributes the runs and recovers from lost processes, whatever the workers are. The
-processes of this machine come from `loky`: they start in half a second, take one thread each for
-linear algebra, listen on no port, and end when they are idle, also after their parent is killed.
-(`dask.distributed.LocalCluster` takes two to eight seconds to start and opens ports on loopback.)
+processes of this machine come from `loky`: they take one thread each for linear algebra, open no
+port, and end when they are idle, also after their parent is killed. On two busy cores two of them
+start in 2 s; those of `dask.distributed.LocalCluster` take 8 to 10 s and open ports on loopback.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from fourbar_ros.studies.campaigns import CampaignError
 _Item = TypeVar('_Item')
 _Result = TypeVar('_Result')
 
+# Environment variables by which linear algebra libraries take their number of threads.
 THREAD_VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
-"""Environment variables by which linear algebra libraries take their number of threads."""
+# Time after which an idle process ends [s]; bounds its life after its parent is killed.
 IDLE_TIMEOUT = 10.0
-"""Time after which an idle process ends [s]; bounds its life after its parent is killed."""
+# Period of the check that the workers still exist [s].
 POLL_PERIOD = 1.0
-"""Period of the check that the workers still exist [s]."""
 
 
 class WorkerLostError(Exception):
