@@ -90,6 +90,7 @@ def test_linear_algebra_takes_one_thread_in_each_process(
     assert list(map_ordered(imported('threads'), [0, 1], 2)) == [['3', '1', '1']] * 2
 
 
+@pytest.mark.slow
 def test_work_of_a_dead_process_is_repeated(
         tmp_path: Path, imported: Callable[[str], Any]) -> None:
     items = [(str(tmp_path), n) for n in range(8)]
@@ -98,6 +99,7 @@ def test_work_of_a_dead_process_is_repeated(
     assert (tmp_path / 'died').exists()
 
 
+@pytest.mark.slow
 def test_item_that_kills_its_process_again_is_an_error(imported: Callable[[str], Any]) -> None:
     """All other items are finished, also those that were lost with it."""
     found = []

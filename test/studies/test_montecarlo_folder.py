@@ -70,6 +70,7 @@ def numbers(files: list[Path]) -> list[int]:
             for run in pyarrow.parquet.read_table(file)['run'].to_pylist()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('jobs', [1, 2])
 def test_killed_campaign_is_resumed(
         campaign_file: Callable[..., str], tmp_path: Path, wait_until: Wait, jobs: int) -> None:
@@ -121,6 +122,7 @@ def alive(group: int) -> bool:
     return True
 
 
+@pytest.mark.slow
 def test_finished_campaign_is_not_run_again_and_takes_more_runs(
         campaign_file: Callable[..., str], tmp_path: Path, refuses: Refuses) -> None:
     path, folder = campaign_file(), tmp_path / 'out'

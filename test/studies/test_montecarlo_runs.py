@@ -61,6 +61,7 @@ def test_metrics_equal_those_of_the_published_topics() -> None:
     assert set(found) - set(expected) == {'nees_per_degree_of_freedom'}
 
 
+@pytest.mark.slow
 def test_nees_and_nis_grow_with_the_square_of_the_sensor_noise(
         campaign_file: Callable[..., str]) -> None:
     """The noise is half, equal to and twice what the estimator assumes."""
@@ -122,6 +123,7 @@ def test_only_is_bit_identical_and_its_scenario_runs_anywhere(
     assert load_scenario(str(folder / 'run_4.yaml')).seed == row['seed']
 
 
+@pytest.mark.slow
 def test_same_seed_gives_same_bytes_for_any_number_of_jobs(
     campaign_file: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

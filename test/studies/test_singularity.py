@@ -166,6 +166,7 @@ def result() -> Result:
     return load_study('singularity')(lambda items, count: items)
 
 
+@pytest.mark.slow
 def test_checks_are_kept_and_numbers_are_told(result: Result) -> None:
     assert [check.name for check in result.checks if not check.passed] == []
     assert len({check.name for check in result.checks}) == len(result.checks)
@@ -183,6 +184,7 @@ def test_checks_are_kept_and_numbers_are_told(result: Result) -> None:
             2.0 * LENGTH * abs(np.sin(0.5 * np.radians(float(row['theta_deg'])))), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_figure_is_whole(result: Result) -> None:
     """Something is drawn in the middle, and nothing at the edges, where it would be cut."""
     image = pytest.importorskip('matplotlib.image')
