@@ -17,7 +17,7 @@ from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.device.interface import no_torque
 from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.estimation import Estimator, EstimatorSettings
-from fourbar_ros.estimation.bias_detection import ALARM
+from fourbar_ros.estimation.bias_detection import GLR_THRESHOLD
 from fourbar_ros.loop.run import make_loop
 from fourbar_ros.loop.scenario import load_scenario
 from fourbar_ros.mechanism import (
@@ -55,7 +55,7 @@ def main() -> None:
                 ('mechanics_linkage', linkage), ('mechanics_change_point', change_point),
                 ('table_friction', friction),
                 ('table_stiction', stiction), ('table_energy', energy),
-                ('table_sensors', sensors), ('estimation_suspicion', suspicion),
+                ('table_sensors', sensors), ('estimation_bias_detection', sensor_bias),
                 ('estimation_change_point', fold), ('calibration_wheels', calibrated_wheels),
                 ('calibration_links', calibrated_links)):
             draw().savefig(IMAGES / f'{name}.png', dpi=110, bbox_inches='tight')
@@ -271,8 +271,8 @@ def sensors() -> Figure:
     return figure
 
 
-def suspicion() -> Figure:
-    """Draw how a small error of one sensor is found, and what it does to the estimate."""
+def sensor_bias() -> Figure:
+    """Draw the detection of a small bias of one sensor, and its effect on the estimate."""
     begin, error = 3.0, np.radians(0.35)
     loop = make_loop(load_scenario('prototype'))
     times, samples, errors, sums = [], [], [], []
@@ -286,7 +286,7 @@ def suspicion() -> Figure:
         now = n * 4e-3 - begin
         times.append(now)
         errors.append((estimate.link_angles[2] - truth.link_angles[2], estimate.angle_sigmas[2]))
-        sums.append([loop.estimator.suspicion()[name] for name in LINK_NAMES])
+        sums.append([loop.estimator.glr_statistics()[name] for name in LINK_NAMES])
         samples += [(now, reading.angles[reading.names.index('link_c')] - truth.link_angles[2])
                     for reading in step.samples.links if 'link_c' in reading.names]
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(9.0, 3.4))
@@ -301,9 +301,9 @@ def suspicion() -> Figure:
     legend_above(left)
     for link, values in enumerate(np.array(sums).T):
         right.plot(times, values, color=LINK_COLOURS[link], label=LINK_NAMES[link])
-    right.axhline(ALARM, color=COLOURS['muted'], linewidth=0.8, linestyle='--')
-    right.annotate('alarm, if 10 ahead of all others', (0.06, ALARM + 0.5), fontsize=8)
-    right.set(xlabel='time [s]', ylabel='suspicion [nats]')
+    right.axhline(GLR_THRESHOLD, color=COLOURS['muted'], linewidth=0.8, linestyle='--')
+    right.annotate('threshold, if 10 ahead of all others', (0.06, GLR_THRESHOLD + 0.5), fontsize=8)
+    right.set(xlabel='time [s]', ylabel='GLR statistic [nats]')
     legend_above(right)
     figure.tight_layout()
     return figure

@@ -5,7 +5,7 @@
 The estimator over a recorded bag: a new bag with other estimates, and both sides by the numbers.
 
 The messages go to the estimator in the order in which the bag has them, by the very door that the
-node has (:mod:`fourbar_ros.estimation.topics`).
+node has (:mod:`fourbar_ros.estimation.estimator_topics`).
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from fourbar_ros.common.names import (
 )
 from fourbar_ros.common.progress import Progress
 from fourbar_ros.estimation import EstimatorSettings
-from fourbar_ros.estimation.parameters import PARAMETERS
-from fourbar_ros.estimation.topics import EstimatorTopics, INPUTS, Message, OUTPUTS
+from fourbar_ros.estimation.estimator_settings import PARAMETERS
+from fourbar_ros.estimation.estimator_topics import EstimatorTopics, INPUTS, OutputMessage, OUTPUTS
 from fourbar_ros.mechanism import LINK_NAMES, load_mechanism
 import numpy as np
 
@@ -309,7 +309,7 @@ class _Run:
                     publish(answer, logged_ns)
         self._conclude()
 
-    def _take(self, name: str, message: Any) -> tuple[Message, ...]:
+    def _take(self, name: str, message: Any) -> tuple[OutputMessage, ...]:
         """Note a message, and hand it to the estimator if it is for it."""
         stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
         if name in (ESTIMATE_LINK_STATES, SIM_LINK_STATES):
@@ -327,7 +327,7 @@ class _Run:
             self._note_tick(stamp_ns, messages)
         return messages
 
-    def _note_tick(self, stamp_ns: int, messages: tuple[Message, ...]) -> None:
+    def _note_tick(self, stamp_ns: int, messages: tuple[OutputMessage, ...]) -> None:
         self.ticks_ns.append(stamp_ns)
         for message in messages:
             if message.topic == ESTIMATE_LINK_STATES:
@@ -392,7 +392,7 @@ class _Publisher:
             topic, HEADER if name == ESTIMATE_WAITING else JOINT_STATE, typestore=self._store,
             offered_qos_profiles=profiles)
 
-    def __call__(self, message: Message, logged_ns: int) -> None:
+    def __call__(self, message: OutputMessage, logged_ns: int) -> None:
         """Write one message."""
         if message.topic not in self._connections:
             self._offer(message.topic)

@@ -11,7 +11,7 @@ from typing import Any
 
 from fourbar_ros.analysis.bags import Floats, JointSeries, Nanoseconds
 from fourbar_ros.analysis.replay import Replay, ReplayError, Side
-from fourbar_ros.estimation.parameters import SETTINGS
+from fourbar_ros.estimation.estimator_settings import SETTINGS
 from fourbar_ros.mechanism import LINK_NAMES
 from fourbar_ros.mechanism.angles import wrap_angles
 import numpy as np

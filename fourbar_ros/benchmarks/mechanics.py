@@ -451,13 +451,13 @@ def _filter_steps() -> Operation:
     settings, period_s = scenario.estimator, scenario.plant.period_ns * 1e-9
     angles = assemble(scenario.mechanism, scenario.initial.link_a, scenario.initial.link_b)
     linkage = LinkageFilter(
-        scenario.mechanism, angles, settings.angle_variance, 1e-4, settings.randomness)
+        scenario.mechanism, angles, settings.angle_variance, 1e-4, settings.process_noise)
     torques, variances = np.zeros(4), settings.variances[:4]
 
     def run() -> None:
         for _ in range(FILTER_STEPS):
-            linkage.move(period_s, torques)
-            linkage.correct((0, 1, 2, 3), linkage.angles, variances, settings.gate)
+            linkage.predict(period_s, torques)
+            linkage.update((0, 1, 2, 3), linkage.angles, variances, settings.gate)
 
     return Operation(lambda: None, run, FILTER_STEPS)
 

@@ -38,7 +38,7 @@ class SettingsError(FourbarError):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options, one for each row of the estimator's table among them."""
-    from fourbar_ros.estimation.parameters import SETTINGS
+    from fourbar_ros.estimation.estimator_settings import SETTINGS
 
     parser.epilog = EPILOG
     parser.add_argument('bag', metavar='BAG', type=Path,
@@ -119,7 +119,7 @@ def _beside(bag: Path) -> Path:
 
 def _values(args: argparse.Namespace) -> dict[str, Any]:
     """Return the parameters that are given: of the options, and of the file where they are not."""
-    from fourbar_ros.estimation.parameters import PARAMETERS, SETTINGS
+    from fourbar_ros.estimation.estimator_settings import PARAMETERS, SETTINGS
 
     values = {} if args.params_file is None else _from_file(
         args.params_file, args.namespace or '', {row.name for row in PARAMETERS})

@@ -2,231 +2,256 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Which sensor has a constant error: one suspicion each, that everything is as it seems but for it.
+Detection and isolation of a sensor with a constant error, by generalised likelihood ratios.
 
-A suspicion is the filter with a bias of one sensor as a further state, split into the filter
-without it and what the bias does to that (B. Friedland, Treatment of bias in recursive filtering,
-IEEE Trans. Automatic Control 14, 1969, p. 359): `effect` is the error of the filter's state per
-bias. The likelihood of what was measured, with that bias over without it, is added up as a
-cumulative sum (E. S. Page, Continuous inspection schemes, Biometrika 41, 1954, p. 100): where it
-would fall below zero the suspicion begins anew, with a filter that has seen no error yet.
+A bias hypothesis says that one sensor has a constant error (bias) and that all else is as the
+filter assumes. It is the filter with that bias as a further state, split into the filter without
+the bias and the effect of the bias (B. Friedland, Treatment of bias in recursive filtering, IEEE
+Trans. Automatic Control 14, 1969, p. 359): `effect` is the error of the state per unit of bias.
+The GLR statistic of a hypothesis is the sum of the log-likelihood ratios of all innovations, with
+the bias over without it. It is a CUSUM (E. S. Page, Continuous inspection schemes, Biometrika 41,
+1954, p. 100; M. Basseville and I. V. Nikiforov, Detection of Abrupt Changes, 1993): where the sum
+falls below zero, it restarts at zero, with a filter that has seen no bias yet.
 
-White noise is the same in both likelihoods, so a sensor's noise raises no suspicion, and neither
-does what the linkage does: partners differ in what they say about it.
+White noise is the same in both likelihoods, so it does not raise the statistic. Neither does a
+motion of the linkage.
 
-Every sensor has a second suspicion, of an error that has been there for long: what a bias does to
-the filter is then what is left when it has settled. Partners explain that equally well. So it is a
-sensor's beginning to err that tells it from its partner, and where nobody saw that, the two sums
-rise together and both are named.
+Each sensor has two hypotheses. Of the *onset* of a bias: the filter had no error before. Of a
+*persistent* bias: the filter has settled to it. The sensors of paired links explain a persistent
+bias equally well. Only the onset isolates the sensor. Where the filter did not see the onset, both
+statistics rise together, and both sensors are suspected.
 """
 
 from __future__ import annotations
 
 from math import log
 
+from fourbar_ros.estimation.filter_model import Records
+from fourbar_ros.estimation.filter_state import MAX_SIZE
 from fourbar_ros.kernels.compiler import kernel
+from fourbar_ros.mechanism import SENSOR_NAMES
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 from numpy.typing import NDArray
 
-# A row of the table of suspicions: these, then the effect (n,).
-BIAS, VARIANCE, LIKELIHOOD, VERDICT, MISFIT = range(5)
-SCALARS = 5
+BiasHypothesis = np.record
+_HYPOTHESIS = np.dtype((np.record, [
+    ('bias', float),            # rad, estimate
+    ('variance', float),        # rad^2, of the estimate
+    ('glr', float),             # nats, GLR statistic
+    ('state', np.int64),        # of the sensor: HEALTHY, SUSPECTED, FAULTY; onset only
+    ('mean_nis', float),        # of the excluded samples of a faulty sensor; onset only
+    ('effect', float, (MAX_SIZE,)),     # error of the state per bias; its first n elements count
+]))
 
-# What the table says of a sensor.
-HEALTHY, SUSPECTED, FAULTY = 0.0, 1.0, 2.0
+ONSET, PERSISTENT = 0, 1
+"""First index of the array of hypotheses; the second one is the sensor."""
 
-# Standard deviation of a bias before anything is known of it [rad], and how it walks: errors that
-# grow are biases, too [rad/sqrt(s)].
+HEALTHY, SUSPECTED, FAULTY = 0, 1, 2
+"""Fault states of a sensor: no bias; biased, or another suspected sensor is; biased."""
+
+# Standard deviation of a bias before it is estimated [rad]: half a degree, below the gate.
 BIAS_SIGMA = 0.01
+
+# Random walk of a bias [rad/sqrt(s)]: errors that grow are found, too.
 BIAS_WALK = 0.005
 
-# A sensor is at fault when its sum reaches so much [nats], one in e^20 by chance, and no other
-# sensor's comes as close as that.
-ALARM = 20.0
-LEAD = 10.0
+# A sensor is faulty when its GLR statistic exceeds the threshold [nats], which chance does once in
+# e^20, and leads the statistics of all other sensors by the margin [nats].
+GLR_THRESHOLD = 20.0
+GLR_MARGIN = 10.0
 
-# Those who come closer are all named when nobody leads by then, and until their sums fall below
-# ALARM. From each sample's sum this is taken off, so that what nothing speaks for any more is
-# forgotten in seconds.
-TOGETHER = 50.0
-FORGET = 0.05
-LEAST = 1e-3
+# When the largest statistic reaches this without a lead, all sensors within the margin are
+# suspected [nats], until their statistics fall below GLR_THRESHOLD. Twice this value bounds all
+# statistics.
+AMBIGUITY_THRESHOLD = 50.0
 
-# A faulty sensor is used again when its samples, over the last so many, are as near to what was
-# expected as noise has them: the mean normalised square of their innovations, 1 in health.
-AGREES_OVER = 50.0
-AGREES_BELOW = 1.6
-LARGEST_SQUARE = 9.0
+# Drift of the CUSUM: this is taken off per update [nats], so that a bias that ended is forgotten
+# within seconds.
+DRIFT = 0.05
+
+# Lower bound of a positive statistic when all are reduced [nats]: its hypothesis stays alive.
+LEAST_GLR = 1e-3
+
+# A faulty sensor is healthy again when the mean NIS of its samples falls below the limit (1 for a
+# healthy sensor). Number of samples of the mean, limit, and largest NIS that one sample counts.
+RECOVERY_SAMPLES = 50.0
+RECOVERY_NIS = 1.6
+LARGEST_NIS = 9.0
 
 
-def no_suspicions(sensors: int, size: int) -> Array:
-    """
-    Return the table (2 sensors, SCALARS + size) that suspects nobody.
-
-    First come the suspicions of errors that began, one for each sensor, then those of old ones;
-    verdicts stand in the first.
-    """
-    table = np.zeros((2 * sensors, SCALARS + size))
-    table[:, VARIANCE] = BIAS_SIGMA ** 2
-    return table
+def initial_hypotheses() -> Records:
+    """Return the bias hypotheses (2, sensors) of healthy sensors."""
+    hypotheses = np.zeros((2, len(SENSOR_NAMES)), _HYPOTHESIS)
+    hypotheses['variance'] = BIAS_SIGMA ** 2
+    return hypotheses
 
 
 @kernel
-def begin_anew(suspicion: Array, without_effect: bool) -> None:
+def _restart(hypothesis: BiasHypothesis, without_effect: bool) -> None:
     """
-    Suspect nothing, but keep the verdict.
+    Restart the CUSUM, but keep the fault state.
 
-    :param without_effect: whether the filter is as if there had been no error.
+    :param without_effect: whether the filter is as if there had been no bias.
     """
-    suspicion[BIAS] = suspicion[LIKELIHOOD] = 0.0
-    suspicion[VARIANCE] = BIAS_SIGMA * BIAS_SIGMA
+    hypothesis.bias = hypothesis.glr = 0.0
+    hypothesis.variance = BIAS_SIGMA * BIAS_SIGMA
     if without_effect:
-        suspicion[SCALARS:] = 0.0
+        hypothesis.effect[:] = 0.0
 
 
 @kernel
-def carry_suspicion(suspicion: Array, transition: Array, duration: float) -> None:
-    """Let the effect of a suspected bias move on with the state, and the bias walk."""
-    size = transition.shape[0]
-    effect = suspicion[SCALARS:]
-    for k in range(size):
-        if effect[k] != 0.0:
-            break
-    else:
-        return
-    moved = np.zeros(size)
-    for i in range(size):
-        for k in range(size):
-            moved[i] += transition[i, k] * effect[k]
-    effect[:] = moved
-    suspicion[VARIANCE] += BIAS_WALK * BIAS_WALK * duration
-
-
-@kernel
-def weigh(suspicions: Array, sensors: NDArray[np.int64], rows: Array, innovation: Array,
-          inverse: Array, gain: Array) -> None:
+def predict_hypotheses(hypotheses: Records, transition: Array, duration: float) -> None:
     """
-    Take an update of the filter into account, in place.
+    Predict all hypotheses in place: effects follow the state, biases walk.
 
-    :param suspicions: (2 sensors, SCALARS + n).
-    :param sensors: (m,) which sensor each innovation is of, below zero for a gyro's.
+    :param hypotheses: (2, sensors).
+    :param transition: (n, n) F.
+    """
+    size = transition.shape[0]
+    moved = np.empty(size)
+    for kind in range(hypotheses.shape[0]):
+        for sensor in range(hypotheses.shape[1]):
+            hypothesis = hypotheses[kind, sensor]
+            effect = hypothesis.effect
+            for k in range(size):
+                if effect[k] != 0.0:
+                    break
+            else:
+                continue
+            for i in range(size):
+                moved[i] = 0.0
+                for k in range(size):
+                    moved[i] += transition[i, k] * effect[k]
+            for i in range(size):
+                effect[i] = moved[i]
+            hypothesis.variance += BIAS_WALK * BIAS_WALK * duration
+
+
+@kernel
+def update_hypotheses(hypotheses: Records, sensors: NDArray[np.int64], rows: Array,
+                      innovation: Array, inverse: Array, gain: Array) -> None:
+    """
+    Add the log-likelihood ratios of one update to the GLR statistics, in place.
+
+    :param hypotheses: (2, sensors).
+    :param sensors: (m,) the sensor of each innovation, below zero for a gyro.
     :param rows: (m, n) H.
     :param innovation: (m,).
-    :param inverse: (m, m) of the innovation's covariance.
-    :param gain: (n, m) K, zero for samples that the gate refused.
+    :param inverse: (m, m) of the covariance of the innovation.
+    :param gain: (n, m) K, zero for samples that the gate rejected.
     """
-    many, size = rows.shape
-    signature, weighted = np.empty(many), np.empty(many)
-    count = suspicions.shape[0] // 2
-    for n in range(2 * count):
-        sensor, old = n % count, n >= count
-        suspicion = suspicions[n]
-        if suspicions[sensor, VERDICT] == FAULTY:
-            continue
-        effect = suspicion[SCALARS:]
-        concerned = suspicion[LIKELIHOOD] > 0.0
-        for m in range(many):
-            # What the bias adds to the innovation, per bias.
-            signature[m] = 1.0 if sensors[m] == sensor else 0.0
-            concerned |= sensors[m] == sensor
-            for i in range(size):
-                signature[m] -= rows[m, i] * effect[i]
-        if not concerned:
-            continue
-        precision = seen = 0.0
-        for m in range(many):
-            weighted[m] = 0.0
-            for k in range(many):
-                weighted[m] += inverse[m, k] * signature[k]
-            precision += signature[m] * weighted[m]
-            seen += weighted[m] * innovation[m]
-        bias, variance = suspicion[BIAS], suspicion[VARIANCE]
-        rest, growth = seen - bias * precision, 1.0 + variance * precision
-        likelihood = suspicion[LIKELIHOOD] + (
-            bias * seen - 0.5 * bias * bias * precision
-            + 0.5 * (rest * rest * variance / growth - log(growth)) - FORGET)
-        if likelihood > 0.0:
-            suspicion[LIKELIHOOD] = likelihood
-            suspicion[VARIANCE] = variance / growth
-            suspicion[BIAS] = bias + suspicion[VARIANCE] * rest
-        else:
-            begin_anew(suspicion, not old)
-        if likelihood > 0.0 or old:
-            for i in range(size):
-                for m in range(many):
-                    effect[i] += gain[i, m] * signature[m]
+    count, size = rows.shape
+    signature, weighted = np.empty(count), np.empty(count)
+    for kind in range(hypotheses.shape[0]):
+        for sensor in range(hypotheses.shape[1]):
+            if hypotheses[ONSET, sensor].state == FAULTY:
+                continue
+            hypothesis = hypotheses[kind, sensor]
+            effect = hypothesis.effect
+            concerned = hypothesis.glr > 0.0
+            for m in range(count):
+                # Effect of the bias on the innovation, per bias.
+                signature[m] = 1.0 if sensors[m] == sensor else 0.0
+                concerned |= sensors[m] == sensor
+                for i in range(size):
+                    signature[m] -= rows[m, i] * effect[i]
+            if not concerned:
+                continue
+            precision = projection = 0.0
+            for m in range(count):
+                weighted[m] = 0.0
+                for k in range(count):
+                    weighted[m] += inverse[m, k] * signature[k]
+                precision += signature[m] * weighted[m]
+                projection += weighted[m] * innovation[m]
+            bias, variance = hypothesis.bias, hypothesis.variance
+            rest, growth = projection - bias * precision, 1.0 + variance * precision
+            glr = hypothesis.glr + (
+                bias * projection - 0.5 * bias * bias * precision
+                + 0.5 * (rest * rest * variance / growth - log(growth)) - DRIFT)
+            if glr > 0.0:
+                hypothesis.glr = glr
+                hypothesis.variance = variance / growth
+                hypothesis.bias = bias + hypothesis.variance * rest
+            else:
+                _restart(hypothesis, kind == ONSET)
+            if glr > 0.0 or kind == PERSISTENT:
+                for i in range(size):
+                    for m in range(count):
+                        effect[i] += gain[i, m] * signature[m]
 
 
 @kernel
-def _stronger(suspicions: Array, sensor: int) -> Array:
-    """Return the likelier of a sensor's two suspicions."""
-    old: Array = suspicions[suspicions.shape[0] // 2 + sensor]
-    new: Array = suspicions[sensor]
-    return old if old[LIKELIHOOD] > new[LIKELIHOOD] else new
+def _likelier(hypotheses: Records, sensor: int) -> int:
+    """Return which hypothesis of a sensor is likelier, ONSET or PERSISTENT."""
+    return PERSISTENT if (
+        hypotheses[PERSISTENT, sensor].glr > hypotheses[ONSET, sensor].glr) else ONSET
 
 
 @kernel
-def judge(x: Array, covariance: Array, suspicions: Array, spared: NDArray[np.bool_]) -> bool:
+def isolate_fault(x: Array, covariance: Array, hypotheses: Records,
+                  indispensable: NDArray[np.bool_]) -> None:
     """
-    Name who is at fault, and undo what the error of one that is left out did, in place.
+    Set the fault states, and remove the effect of a newly faulty sensor from the state, in place.
 
-    :param spared: (sensors,) those that cannot be done without.
-    :returns: whether the state was changed.
+    :param indispensable: (sensors,) those that no other sensor replaces; they stay in use.
     """
-    count = suspicions.shape[0] // 2
+    count = hypotheses.shape[1]
     worst, highest = 0, 0.0
     for sensor in range(count):
-        likelihood = _stronger(suspicions, sensor)[LIKELIHOOD]
-        if likelihood > highest:
-            worst, highest = sensor, likelihood
-    # None is so high that it could not be forgotten; the differences stay.
-    excess = max(0.0, highest - 2.0 * TOGETHER)
+        glr = hypotheses[_likelier(hypotheses, sensor), sensor].glr
+        if glr > highest:
+            worst, highest = sensor, glr
+    # Bound the statistics, so that each can fall again in time; differences stay.
+    excess = max(0.0, highest - 2.0 * AMBIGUITY_THRESHOLD)
     if excess > 0.0:
-        for suspicion in suspicions:
-            if suspicion[LIKELIHOOD] > 0.0:
-                suspicion[LIKELIHOOD] = max(suspicion[LIKELIHOOD] - excess, LEAST)
+        for kind in range(2):
+            for sensor in range(count):
+                hypothesis = hypotheses[kind, sensor]
+                if hypothesis.glr > 0.0:
+                    hypothesis.glr = max(hypothesis.glr - excess, LEAST_GLR)
         highest -= excess
-    alone = highest > ALARM
+    isolated = highest > GLR_THRESHOLD
     for sensor in range(count):
-        if suspicions[sensor, VERDICT] == FAULTY:
+        hypothesis = hypotheses[ONSET, sensor]
+        if hypothesis.state == FAULTY:
             continue
-        likelihood = _stronger(suspicions, sensor)[LIKELIHOOD]
-        close = likelihood > highest - LEAD
-        if highest > TOGETHER and close:
-            suspicions[sensor, VERDICT] = SUSPECTED
-        elif likelihood < ALARM or not close:
-            suspicions[sensor, VERDICT] = HEALTHY
-        alone &= sensor == worst or not close
-    if alone and spared[worst]:
-        suspicions[worst, VERDICT] = SUSPECTED
-    if not alone or spared[worst]:
-        return False
-    suspicion = _stronger(suspicions, worst)
-    bias, variance = suspicion[BIAS], suspicion[VARIANCE]
-    for i in range(x.size):
-        x[i] -= suspicion[SCALARS + i] * bias
-        for k in range(x.size):
-            covariance[i, k] += (variance * suspicion[SCALARS + i] * suspicion[SCALARS + k])
-    # The others' sums are about a filter that believed this one.
-    for n in range(2 * count):
-        if suspicions[n % count, VERDICT] != FAULTY:
-            begin_anew(suspicions[n], True)
-    suspicions[worst, VERDICT], suspicions[worst, MISFIT] = FAULTY, LARGEST_SQUARE
-    suspicions[worst, BIAS] = bias
-    return True
+        glr = hypotheses[_likelier(hypotheses, sensor), sensor].glr
+        close = glr > highest - GLR_MARGIN
+        if highest > AMBIGUITY_THRESHOLD and close:
+            hypothesis.state = SUSPECTED
+        elif glr < GLR_THRESHOLD or not close:
+            hypothesis.state = HEALTHY
+        isolated &= sensor == worst or not close
+    if not isolated:
+        return
+    if indispensable[worst]:
+        hypotheses[ONSET, worst].state = SUSPECTED
+        return
+    hypothesis = hypotheses[_likelier(hypotheses, worst), worst]
+    bias, variance, effect = hypothesis.bias, hypothesis.variance, hypothesis.effect[:x.size]
+    x -= effect * bias
+    covariance += np.outer(variance * effect, effect)
+    # The other statistics belong to a filter that used this sensor.
+    for kind in range(2):
+        for sensor in range(count):
+            if hypotheses[ONSET, sensor].state != FAULTY:
+                _restart(hypotheses[kind, sensor], True)
+    onset = hypotheses[ONSET, worst]
+    onset.state, onset.mean_nis, onset.bias = FAULTY, LARGEST_NIS, bias
 
 
 @kernel
-def seen_again(suspicions: Array, sensor: int, square: float) -> None:
+def check_recovery(hypotheses: Records, sensor: int, nis: float) -> None:
     """
-    Take note of a sample of a faulty sensor that was not used; it may have come back.
+    Set a faulty sensor to healthy when its excluded samples agree with the filter again.
 
-    :param square: of its innovation, normalised.
+    :param nis: of the newest sample.
     """
-    suspicion = suspicions[sensor]
-    suspicion[MISFIT] += (min(square, LARGEST_SQUARE) - suspicion[MISFIT]) / AGREES_OVER
-    if suspicion[MISFIT] < AGREES_BELOW:
-        suspicion[VERDICT] = HEALTHY
-        begin_anew(suspicion, True)
-        begin_anew(suspicions[suspicions.shape[0] // 2 + sensor], True)
+    onset = hypotheses[ONSET, sensor]
+    onset.mean_nis += (min(nis, LARGEST_NIS) - onset.mean_nis) / RECOVERY_SAMPLES
+    if onset.mean_nis < RECOVERY_NIS:
+        onset.state = HEALTHY
+        _restart(onset, True)
+        _restart(hypotheses[PERSISTENT, sensor], True)

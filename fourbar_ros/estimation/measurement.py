@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What was measured at one time, as the estimator keeps it."""
+"""Measurements: the samples of all sensors with one stamp."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from math import isnan, nan
 from typing import NamedTuple
 
 from fourbar_ros.common.named_values import values_by_name
-from fourbar_ros.estimation.filter import GYROS
+from fourbar_ros.estimation.filter_state import GYROS
 from fourbar_ros.mechanism import JOINT_LINKS, SENSOR_NAMES
 from fourbar_ros.mechanism.angles import wrap
 from fourbar_ros.mechanism.constants import Array
@@ -19,10 +19,10 @@ import numpy as np
 
 class Measurement(NamedTuple):
     """
-    Samples of one time, as they sort in time.
+    Samples with one stamp.
 
-    :param stamp_ns: of the measurement [ns].
-    :param sensors: indices of `SENSOR_NAMES`, then from `GYROS` on those of gyros.
+    :param stamp_ns: time of measurement [ns].
+    :param sensors: indices of `SENSOR_NAMES`, then from `GYROS` on of their gyros.
     :param values: (m,) angles, wrapped [rad], and rates [rad/s].
     """
 
@@ -31,7 +31,7 @@ class Measurement(NamedTuple):
     values: Array
 
     def in_time(self) -> tuple[int, tuple[int, ...]]:
-        """Sort by stamp, and samples of one stamp in an order that arrival has no part in."""
+        """Return the sort key: stamp, then sensors, independent of the order of arrival."""
         return self.stamp_ns, self.sensors
 
     def angles(self) -> dict[int, float]:
@@ -40,7 +40,7 @@ class Measurement(NamedTuple):
                 if sensor < GYROS}
 
     def without(self, sensors: set[int]) -> Measurement | None:
-        """Leave some sensors and their gyros out; None if nothing else was measured."""
+        """Return the measurement without some sensors and their gyros; None if it is empty."""
         kept = [n for n, sensor in enumerate(self.sensors) if sensor % GYROS not in sensors]
         if not kept:
             return None
@@ -48,18 +48,18 @@ class Measurement(NamedTuple):
             self.stamp_ns, tuple(self.sensors[n] for n in kept), self.values[kept])
 
     def link_angles(self) -> Array:
-        """Work out the link angles (4,) that follow without the closure, NaN the others [rad]."""
+        """Return the link angles that follow without the closure (4,), the others NaN [rad]."""
         measured = self.angles()
-        found = [measured.get(link, nan) for link in range(4)]
-        # Once around the loop from any link, either way.
+        links = [measured.get(link, nan) for link in range(4)]
+        # Once around the loop from any link, in both senses.
         for _ in range(3):
             for sensor, (first, second) in enumerate(JOINT_LINKS, 4):
                 relative = measured.get(sensor, nan)
-                if isnan(found[second]):
-                    found[second] = found[first] + relative
-                if isnan(found[first]):
-                    found[first] = found[second] - relative
-        return np.array(found)
+                if isnan(links[second]):
+                    links[second] = links[first] + relative
+                if isnan(links[first]):
+                    links[first] = links[second] - relative
+        return np.array(links)
 
 
 def sensor_name(sensor: int) -> str:
@@ -70,12 +70,12 @@ def sensor_name(sensor: int) -> str:
 def read_measurement(stamp_ns: int, names: Sequence[str], angles: Sequence[float],
                      rates: Sequence[float]) -> Measurement:
     """
-    Check what was measured, and sort it by sensor.
+    Check the samples of a message, and sort them by sensor.
 
     :param stamp_ns: time of measurement [ns].
     :param names: any of `SENSOR_NAMES`, in any order.
     :param angles: of each, any turn [rad].
-    :param rates: of each from its gyro [rad/s], or nothing.
+    :param rates: of each from its gyro [rad/s], or empty.
     :raises RejectedError: kinds `length`, `names`, `finite`.
     """
     measured = values_by_name(names, angles, SENSOR_NAMES, 'position')

@@ -24,7 +24,7 @@ from fourbar_ros.control import ControllerSettings
 from fourbar_ros.control.parameters import SETTINGS as CONTROLLER
 from fourbar_ros.device import SupervisorSettings
 from fourbar_ros.estimation import EstimatorSettings
-from fourbar_ros.estimation.parameters import SETTINGS as ESTIMATOR
+from fourbar_ros.estimation.estimator_settings import SETTINGS as ESTIMATOR
 from fourbar_ros.mechanism import assemble, LINK_NAMES, load_mechanism, Mechanism
 from fourbar_ros.mechanism.closure import BRANCHES
 from fourbar_ros.mechanism.constants import Array

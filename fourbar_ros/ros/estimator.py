@@ -16,9 +16,14 @@ from fourbar_ros.common.names import (
     FLYWHEEL_STATES,
 )
 from fourbar_ros.estimation import EstimatorSettings
-from fourbar_ros.estimation.estimator import BY_SPEED
-from fourbar_ros.estimation.parameters import PARAMETERS
-from fourbar_ros.estimation.topics import EstimatorTopics, INPUTS, Message, OUTPUTS
+from fourbar_ros.estimation.estimator_settings import PARAMETERS
+from fourbar_ros.estimation.estimator_topics import (
+    EstimatorTopics,
+    INPUTS,
+    OutputMessage,
+    OUTPUTS,
+)
+from fourbar_ros.estimation.wheel_motion import BY_SPEED
 from fourbar_ros.mechanism import load_mechanism
 from fourbar_ros.ros.base_node import BaseNode, run_node
 from fourbar_ros.ros.messages import (
@@ -97,7 +102,7 @@ class EstimatorNode(BaseNode):
             self.logger.info(
                 'started' if starts == 1 else f'acquired the linkage again, start {starts}')
 
-    def _publish(self, output: Message) -> None:
+    def _publish(self, output: OutputMessage) -> None:
         if output.topic == ESTIMATE_WAITING:
             header = Header()
             write_stamp(header.stamp, output.stamp_ns)

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from math import ceil, sqrt
 
-from fourbar_ros.estimation.estimator import INITIAL_ANGLE_SIGMA, INITIAL_RATE_SIGMA
-from fourbar_ros.estimation.filter import LinkageFilter, WALKED_BEFORE
+from fourbar_ros.estimation.filter import LinkageFilter, TORQUE_WALK_AGE
+from fourbar_ros.estimation.retrodiction import INITIAL_ANGLE_SIGMA, INITIAL_RATE_SIGMA
 from fourbar_ros.loop import make_loop, run_scenario, Scenario, Step
 from fourbar_ros.mechanism import JOINT_LINKS, LINK_NAMES
 from fourbar_ros.mechanism.constants import Array
@@ -65,7 +65,7 @@ def execute(scenario: Scenario) -> RunSums:
         if (seen := estimate.innovation) is not None:
             nis[n], degrees[n] = seen.nis, seen.degrees_of_freedom
             for sensor, value, square, used in zip(
-                    seen.sensors, seen.values, seen.squares, seen.used):
+                    seen.sensors, seen.values, seen.sample_nis, seen.used):
                 if used and sensor < len(LINK_NAMES):
                     innovations[n, sensor] = np.copysign(sqrt(square), value)
     known = np.isfinite(errors[:, 0])
@@ -116,7 +116,7 @@ def information(scenario: Scenario, states: Array, wheel_speeds: Array
     """
     mechanism, settings = scenario.mechanism, scenario.estimator
     period = scenario.plant.period_ns * 1e-9
-    linkage = LinkageFilter(mechanism, states[0, :4], 1e-6, 1e-6, settings.randomness)
+    linkage = LinkageFilter(mechanism, states[0, :4], 1e-6, 1e-6, settings.process_noise)
     torques = mechanism.flywheel_inertias * np.diff(wheel_speeds, axis=0) / period
     some_covariance = linkage.P.copy()
     steps, kept = len(states), np.ix_(KEPT, KEPT)
@@ -129,7 +129,7 @@ def information(scenario: Scenario, states: Array, wheel_speeds: Array
         seen[n, :2, :2] = weight * (np.eye(2) + gamma.T @ gamma)
         if n < steps - 1:
             linkage.x, linkage.P = state.copy(), some_covariance.copy()
-            linkage.move(period, torques[n])
+            linkage.predict(period, torques[n])
             transitions[n], noises[n] = linkage.F[kept], linkage.Q[kept]
     driven: Array = np.asarray(np.linalg.inv(noises), dtype=np.float64)
     crossed: Array = np.swapaxes(transitions, 1, 2) @ driven
@@ -146,7 +146,7 @@ def bound_of(scenario: Scenario, sums: RunSums) -> Array:
     settings = scenario.estimator
     start = np.diag(1.0 / np.repeat([
         INITIAL_ANGLE_SIGMA ** 2, INITIAL_RATE_SIGMA ** 2,
-        WALKED_BEFORE * settings.disturbance_walk ** 2], 2))
+        TORQUE_WALK_AGE * settings.disturbance_walk ** 2], 2))
     late = ceil(scenario.table.link_sensors.latency * scenario.plant.rate - 1e-6)
     carried, crossed, driven, seen = (each / sums.runs for each in (
         sums.carried, sums.crossed, sums.driven, sums.seen))

@@ -201,12 +201,12 @@ def closed_loop_messages(scenario, namespace=''):
         add('estimate/disturbance', joint_state(
             stamp, ['torque_a', 'torque_b', 'sigma_a', 'sigma_b'],
             [*estimate.disturbance, *estimate.disturbance_sigmas]))
-        if decisions := loop.estimator.decisions():
+        if decisions := loop.estimator.sample_statuses():
             add('estimate/decisions', joint_state(
                 stamp, [SENSOR_NAMES[decision.sensor] for decision in decisions],
-                [float(decision.reason) for decision in decisions],
-                [decision.square for decision in decisions],
-                [float(decision.reason == 0) for decision in decisions]))
+                [float(decision.status) for decision in decisions],
+                [decision.nis for decision in decisions],
+                [float(decision.status == 0) for decision in decisions]))
         if (seen := estimate.innovation) is not None:
             add('estimate/innovation', joint_state(
                 stamp, ['nis', 'degrees_of_freedom',

@@ -13,7 +13,7 @@ from fourbar_ros.analysis.bags import read_bag
 from fourbar_ros.cli.main import main
 from fourbar_ros.common.config_files import share_directory
 from fourbar_ros.estimation import EstimatorSettings
-from fourbar_ros.estimation.parameters import SETTINGS
+from fourbar_ros.estimation.estimator_settings import SETTINGS
 from fourbar_ros.loop import load_scenario
 import pytest
 

@@ -1,19 +1,22 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The estimator follows the linkage through everything that topics may do to its inputs."""
+"""The estimator follows the linkage under late, lost, wrong and missing inputs."""
 
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import combinations
 from math import inf, nan, pi
 from typing import Any
 
 from fourbar_ros.common.named_values import RejectedError
-from fourbar_ros.estimation import DECISIONS, Estimate, Estimator, EstimatorSettings
+from fourbar_ros.estimation import Estimate, Estimator, EstimatorSettings, SAMPLE_STATUSES
 from fourbar_ros.mechanism import assemble, branch_of, LINK_NAMES, Mechanism
+from fourbar_ros.mechanism.forces import surroundings
+from fourbar_ros.mechanism.integration import move_held
+from fourbar_ros.mechanism.state import LINK_ANGLES, LINK_RATES, make_state, WHEEL_SPEEDS
 from fourbar_ros.plant import Fault, InitialState, Plant, Table
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelEncoders
@@ -29,12 +32,12 @@ NOISE = 1.7453e-3
 REAL = Table(LinkSensorSettings(noise_rms=NOISE, counts_per_turn=16384), WheelEncoders(16384))
 PERFECT = Table(LinkSensorSettings(), WheelEncoders(0))
 STILL = [0.0] * 4
-# With noise the errors stay within so many sigmas: 4000 numbers exceed 5 with p = 0.002.
+# Bound of errors in sigmas: one of 4000 normal numbers exceeds 5 with p = 0.002.
 SIGMAS = 5.0
 
 
 class Run:
-    """A plant and an estimator that watches it, tick by tick."""
+    """A plant and an estimator of its motion, tick by tick."""
 
     def __init__(self, mechanism: Mechanism, initial: InitialState, table: Table = REAL,
                  seed: int = 0) -> None:
@@ -120,8 +123,8 @@ def joint_encoders(heading: str) -> Table:
 
 
 @pytest.mark.parametrize('heading', LINK_NAMES)
-def test_joint_encoders_and_a_heading_do_as_well(heading: str, mechanism: Mechanism) -> None:
-    """Errors settle within their sigmas, whatever link has the absolute sensor."""
+def test_joint_encoders_and_a_heading_are_as_accurate(heading: str, mechanism: Mechanism) -> None:
+    """Errors settle within their sigmas, for an absolute sensor on any link."""
     run = Run(mechanism, InitialState(0.3, 1.6, 'open', 0.5, -0.3), joint_encoders(heading))
     assert len(run.after(250).innovation.sensors) == 5
     for estimate in run.ticks(250):
@@ -134,7 +137,7 @@ def test_joint_encoders_and_a_heading_do_as_well(heading: str, mechanism: Mechan
 def test_start_needs_three_joint_encoders_beside_the_heading(
     branch: str, left_out: int, uneven: Mechanism,
 ) -> None:
-    """The angles around the loop follow either way, and tell the branch."""
+    """The angles around the loop follow in both senses, and determine the branch."""
     run = Run(uneven, InitialState(3.0, 4.4, branch), joint_encoders('link_c'))
     estimate = run.tick(tuple(sensor for sensor in range(5) if sensor != left_out))
     assert estimate is not None
@@ -142,8 +145,8 @@ def test_start_needs_three_joint_encoders_beside_the_heading(
     assert (np.abs(run.unwrapped_error(estimate)) < SIGMAS * estimate.angle_sigmas).all()
 
 
-def test_joint_encoders_alone_do_not_start_it(paper: Mechanism) -> None:
-    """They read the same however the whole is turned."""
+def test_joint_encoders_alone_do_not_start_the_filter(paper: Mechanism) -> None:
+    """They do not measure the orientation of the whole."""
     run = Run(paper, InitialState(0.3, 1.6), joint_encoders('link_a'))
     assert run.tick((0, 1, 2, 3)) is None
     assert 'link_a' in run.estimator.waiting_for
@@ -152,8 +155,8 @@ def test_joint_encoders_alone_do_not_start_it(paper: Mechanism) -> None:
 
 @pytest.mark.parametrize(
     'links', [links for n in (1, 2, 3) for links in combinations(range(4), n)])
-def test_any_subset_of_links_keeps_it_going(links: tuple[int, ...], uneven: Mechanism) -> None:
-    """After a start from all four, one link alone corrects what it can and disturbs nothing."""
+def test_any_subset_of_links_updates_the_filter(links: tuple[int, ...], uneven: Mechanism) -> None:
+    """After a start from all four links, one link alone corrects the estimate."""
     run = Run(uneven, InitialState(0.3, 1.6, 'open', 0.2, -0.1))
     run.after(100)
     for estimate in run.ticks(100, links):
@@ -163,7 +166,7 @@ def test_any_subset_of_links_keeps_it_going(links: tuple[int, ...], uneven: Mech
         assert np.abs(run.unwrapped_error(estimate)).max() < SIGMAS * max(estimate.angle_sigmas)
 
 
-def test_without_samples_wheels_alone_carry_it(mechanism: Mechanism) -> None:
+def test_without_samples_wheels_alone_drive_the_prediction(mechanism: Mechanism) -> None:
     """Silence of 0.2 s, with the motors working."""
     run = Run(mechanism, InitialState(0.3, 1.6, 'open', 0.2, -0.1))
     estimate = run.after(250)
@@ -207,7 +210,7 @@ def names_of(*links: int) -> list[str]:
 
 @pytest.mark.parametrize('branch', ['open', 'crossed'])
 @pytest.mark.parametrize('missing', range(4))
-def test_three_links_tell_the_branch(mechanism: Mechanism, branch: str, missing: int) -> None:
+def test_three_links_determine_the_branch(mechanism: Mechanism, branch: str, missing: int) -> None:
     angles = angles_of(mechanism, branch)
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -222,8 +225,8 @@ def test_three_links_tell_the_branch(mechanism: Mechanism, branch: str, missing:
         assert np.abs(wrapped).max() < 4.0 * 3.0 * NOISE, f'seed {seed}'
 
 
-def test_links_that_are_measured_one_after_the_other_start_it(mechanism: Mechanism) -> None:
-    """As on a bus: each at a time of its own, and none tells enough alone."""
+def test_links_measured_one_after_the_other_start_the_filter(mechanism: Mechanism) -> None:
+    """As on a bus: each link has its own stamp, and no link suffices alone."""
     angles = angles_of(mechanism, 'open')
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -237,7 +240,7 @@ def test_links_that_are_measured_one_after_the_other_start_it(mechanism: Mechani
         assert np.abs(wrapped).max() < 4.0 * 3.0 * NOISE, f'seed {seed}'
 
 
-def test_links_that_are_measured_long_after_each_other_do_not(paper: Mechanism) -> None:
+def test_links_measured_long_after_each_other_do_not_start_it(paper: Mechanism) -> None:
     estimator = Estimator(paper, EstimatorSettings())
     angles = angles_of(paper, 'open')
     for count, link in enumerate((0, 1, 3)):
@@ -246,7 +249,7 @@ def test_links_that_are_measured_long_after_each_other_do_not(paper: Mechanism) 
 
 
 @pytest.mark.parametrize('links', [(0,), (0, 1), (0, 2), (1, 3), (2, 3)])
-def test_fewer_do_not_start_it(links: tuple[int, ...], paper: Mechanism) -> None:
+def test_fewer_links_do_not_start_the_filter(links: tuple[int, ...], paper: Mechanism) -> None:
     estimator = Estimator(paper, EstimatorSettings())
     assert estimator.waiting_for == 'flywheel_states'
     estimator.measure(FIRST_NS, names_of(*links), list(angles_of(paper, 'open')[list(links)]))
@@ -255,13 +258,13 @@ def test_fewer_do_not_start_it(links: tuple[int, ...], paper: Mechanism) -> None
     assert estimator.starts == 0
 
 
-def test_angles_that_do_not_fit_together_do_not_start_it(uneven: Mechanism) -> None:
+def test_inconsistent_angles_do_not_start_the_filter(uneven: Mechanism) -> None:
     long = Mechanism(  # type: ignore[arg-type]
         [0.3, 0.3, 0.2, 0.2], [0.02] * 4, [2e-5] * 4, [[0.05, 0.0]] * 4, [3e-7] * 4)
     estimator = Estimator(long, EstimatorSettings())
     estimator.measure(FIRST_NS, list(LINK_NAMES), [0.0, 3.0, 0.0, 3.0])
     assert estimator.tick(FIRST_NS, STILL) is None
-    assert 'fit together' in estimator.waiting_for
+    assert estimator.starts == 0
     assert 'link_b = 3' in estimator.waiting_for
 
 
@@ -273,7 +276,15 @@ def test_waiting_ends_with_a_good_sample(paper: Mechanism) -> None:
     assert run.estimator.starts == 1
 
 
-# What is rejected
+# Rejections
+
+@contextmanager
+def rejected(kind: str) -> Iterator[pytest.ExceptionInfo[RejectedError]]:
+    """Expect a rejection of a kind."""
+    with pytest.raises(RejectedError) as caught:
+        yield caught
+    assert caught.value.kind == kind
+
 
 @pytest.fixture
 def running(paper: Mechanism) -> Run:
@@ -296,9 +307,8 @@ def running(paper: Mechanism) -> Run:
 def test_unusable_sample_is_rejected_whole_and_counted(
     kind: str, names: list[str], angles: list[float], running: Run,
 ) -> None:
-    with pytest.raises(RejectedError) as caught:
+    with rejected(kind) as caught:
         running.estimator.measure(running.stamp_ns + PERIOD_NS, names, angles)
-    assert caught.value.kind == kind
     assert running.estimator.rejected == Counter({kind: 1})
     assert running.estimator.last_rejection == str(caught.value)
     # Nothing of it was kept: the tick's own sample is still welcome, and the only one.
@@ -310,24 +320,22 @@ def test_repeated_sample_is_rejected(running: Run) -> None:
     stamp = running.stamp_ns + PERIOD_NS
     running.estimator.measure(stamp, ['link_a', 'link_b'], [0.0, 1.0])
     for names in (['link_a'], ['link_b', 'link_c']):
-        with pytest.raises(RejectedError) as caught:
+        with rejected('repeated'):
             running.estimator.measure(stamp, names, [0.0] * len(names))
-        assert caught.value.kind == 'repeated'
     running.estimator.measure(stamp, ['link_c'], [0.0])
     assert running.estimator.rejected == Counter(repeated=2)
 
 
 @pytest.mark.parametrize('age_ms', [101, 500, 999])
 def test_late_sample_is_rejected(age_ms: int, running: Run) -> None:
-    with pytest.raises(RejectedError) as caught:
+    with rejected('late'):
         running.estimator.measure(running.stamp_ns - age_ms * 1_000_000, ['link_a'], [0.5])
-    assert caught.value.kind == 'late'
     assert running.estimator.rejected == Counter(late=1)
 
 
 @pytest.mark.parametrize('age_s', [2, 3600])
-def test_very_late_sample_does_not_pass_for_a_new_one(age_s: int, running: Run) -> None:
-    """Older than a restart of time may look like, but the ticks go on: it must do nothing."""
+def test_very_late_sample_is_not_taken_as_new(age_s: int, running: Run) -> None:
+    """As old as after a restart of time, but the ticks go on: it has no effect."""
     try:
         running.estimator.measure(
             running.stamp_ns - age_s * 1_000_000_000, list(LINK_NAMES), [0.5, 1.5, 0.5, 1.5])
@@ -337,7 +345,7 @@ def test_very_late_sample_does_not_pass_for_a_new_one(age_s: int, running: Run) 
     assert np.abs(running.error(estimate)).max() < 1e-6
 
 
-def test_sample_of_the_last_tick_still_serves_the_next(running: Run) -> None:
+def test_sample_of_the_last_tick_is_used_at_the_next(running: Run) -> None:
     (estimate,) = running.ticks(1, ())
     assert estimate.innovation is None
     running.estimator.measure(
@@ -349,27 +357,25 @@ def test_sample_of_the_last_tick_still_serves_the_next(running: Run) -> None:
 @pytest.mark.parametrize('speeds', [[0.0] * 3, [0.0] * 5, [0.0, nan, 0.0, 0.0],
                                     [inf, 0.0, 0.0, 0.0]])
 def test_unusable_wheel_speeds_are_rejected(speeds: list[float], running: Run) -> None:
-    with pytest.raises(RejectedError) as caught:
+    with rejected('wheels'):
         running.estimator.tick(running.stamp_ns + PERIOD_NS, speeds)
-    assert caught.value.kind == 'wheels'
     assert running.estimator.rejected == Counter(wheels=1)
     (estimate,) = running.ticks(1)
     assert np.abs(running.error(estimate)).max() < 1e-6
 
 
 @pytest.mark.parametrize('behind_ns', [0, 1, PERIOD_NS])
-def test_tick_that_was_there_is_rejected(behind_ns: int, running: Run) -> None:
-    with pytest.raises(RejectedError) as caught:
+def test_tick_not_newer_than_the_last_is_rejected(behind_ns: int, running: Run) -> None:
+    with rejected('stamp'):
         running.estimator.tick(running.stamp_ns - behind_ns, STILL)
-    assert caught.value.kind == 'stamp'
     assert running.estimator.starts == 1
 
 
 # Restarts
 
 @pytest.mark.parametrize('jump_ns', [-5_000_000_000, 1_100_000_000, 3600 * 10 ** 9])
-def test_another_time_is_another_run(jump_ns: int, paper: Mechanism) -> None:
-    """Time goes back, or on after a gap, and the linkage is somewhere else."""
+def test_jump_of_time_begins_a_new_run(jump_ns: int, paper: Mechanism) -> None:
+    """Time goes back, or on after a gap, and the configuration is another."""
     run = Run(paper, InitialState(), PERFECT)
     run.stamp_ns += 10_000_000_000
     run.after(10)
@@ -383,8 +389,8 @@ def test_another_time_is_another_run(jump_ns: int, paper: Mechanism) -> None:
     assert not estimate.link_rates.any()
 
 
-def test_another_run_knows_nothing_of_the_sensors_of_the_last(paper: Mechanism) -> None:
-    """Time goes back, and a sensor of then is not there any more."""
+def test_new_run_forgets_the_sensors_of_the_last(paper: Mechanism) -> None:
+    """Time goes back, and one sensor is missing from then on."""
     run = Run(paper, InitialState())
     run.stamp_ns += 10_000_000_000
     run.after(10)
@@ -395,7 +401,7 @@ def test_another_run_knows_nothing_of_the_sensors_of_the_last(paper: Mechanism) 
         assert run.estimator.sensor_faults() == {}
 
 
-def test_gap_of_less_is_bridged(paper: Mechanism) -> None:
+def test_gap_of_less_than_a_second_is_bridged(paper: Mechanism) -> None:
     run = Run(paper, InitialState(), PERFECT)
     run.after(10)
     run.stamp_ns += 900_000_000
@@ -424,7 +430,7 @@ def test_reset_before_the_first_tick_does_nothing(paper: Mechanism) -> None:
     assert run.tick() is not None
 
 
-def test_covariance_is_that_of_the_sigmas(paper: Mechanism) -> None:
+def test_covariance_agrees_with_the_sigmas(paper: Mechanism) -> None:
     estimate = Run(paper, InitialState()).after(50)
     np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), [
         *estimate.angle_sigmas[:2], *estimate.rate_sigmas[:2]], rtol=1e-12)
@@ -433,7 +439,7 @@ def test_covariance_is_that_of_the_sigmas(paper: Mechanism) -> None:
 
 @pytest.mark.parametrize('jump', [0.5, -2.0, 3.0])
 def test_lost_filter_recovers(jump: float, paper: Mechanism) -> None:
-    """Somebody lifts the linkage and puts it back turned: within 20 samples all is well."""
+    """The linkage is lifted and put back rotated: the filter recovers within 20 samples."""
     run = Run(paper, InitialState())
     run.after(250)
     elsewhere = Run(paper, InitialState(jump, jump + 1.5), seed=1)
@@ -454,7 +460,7 @@ def test_noise_alone_never_restarts_it(paper: Mechanism) -> None:
 # The gate
 
 def measured_with(run: Run, offsets: Array) -> Estimate:
-    """Advance by a period with offsets on what the four sensors say [rad]."""
+    """Advance by a period with offsets of the four sensors [rad]."""
     estimate = run.tick(offsets=offsets)
     assert estimate is not None and estimate.innovation is not None
     return estimate
@@ -462,7 +468,7 @@ def measured_with(run: Run, offsets: Array) -> Estimate:
 
 @pytest.mark.parametrize('sensor', range(4))
 @pytest.mark.parametrize('offset', [0.05, -0.5, 3.0])
-def test_wrong_sensor_is_left_out_until_it_agrees_again(
+def test_wrong_sensor_is_gated_until_it_agrees_again(
     sensor: int, offset: float, mechanism: Mechanism,
 ) -> None:
     run = Run(mechanism, InitialState(0.3, 1.6, 'open', 0.5, -0.3))
@@ -481,8 +487,8 @@ def test_wrong_sensor_is_left_out_until_it_agrees_again(
     assert run.estimator.starts == 1
 
 
-def test_gate_refuses_as_many_as_it_says(paper: Mechanism) -> None:
-    """One in a hundred of healthy samples, and healthy sensors are not named; seed 2."""
+def test_gate_rejects_the_fraction_of_its_probability(paper: Mechanism) -> None:
+    """One in a hundred of healthy samples, and healthy sensors have no fault; seed 2."""
     run = Run(paper, InitialState(0.3, 1.6, 'open', 0.5, -0.3), seed=2)
     run.estimator = Estimator(paper, EstimatorSettings(
         angle_noise=NOISE, disturbance_torque=1e-7, gate_probability=0.99))
@@ -495,8 +501,8 @@ def test_gate_refuses_as_many_as_it_says(paper: Mechanism) -> None:
 
 
 @pytest.mark.parametrize('sensor', range(4))
-def test_stuck_sensor_is_named_at_once_and_left_out(sensor: int, mechanism: Mechanism) -> None:
-    """Even at rest, where its frozen sample fits better than any other."""
+def test_stuck_sensor_is_reported_at_once_and_excluded(sensor: int, mechanism: Mechanism) -> None:
+    """Also at rest, where its frozen sample fits better than any other."""
     run = Run(mechanism, InitialState(0.3, 1.6))
     run.after(250)
     run.plant.link_sensors.set_faults({LINK_NAMES[sensor]: Fault(LINK_NAMES[sensor], 'stuck')})
@@ -520,7 +526,7 @@ def test_links_at_rest_under_sensors_without_noise_are_not_stuck(paper: Mechanis
     assert len(run.after(1).innovation.sensors) == 4
 
 
-def test_silent_sensor_is_named_and_comes_back(paper: Mechanism) -> None:
+def test_silent_sensor_is_reported_and_recovers(paper: Mechanism) -> None:
     run = Run(paper, InitialState(0.3, 1.6))
     run.after(50)
     for n, _ in enumerate(run.ticks(60, (0, 1, 3)), 1):
@@ -531,8 +537,10 @@ def test_silent_sensor_is_named_and_comes_back(paper: Mechanism) -> None:
 
 
 @pytest.mark.parametrize('garbage', [False, True])
-def test_blind_for_a_second_and_then_lost(garbage: bool, paper: Mechanism) -> None:
-    """Whether nothing comes or nothing of use; a good sample starts it anew, on the same turn."""
+def test_estimate_is_lost_a_second_after_the_last_accepted_sample(
+    garbage: bool, paper: Mechanism,
+) -> None:
+    """Without samples or with outliers only; a good sample restarts it on the same turn."""
     run = Run(paper, InitialState(0.3, 1.6, 'open', 0.4, -0.3))
     run.after(250)
 
@@ -555,7 +563,7 @@ def test_blind_for_a_second_and_then_lost(garbage: bool, paper: Mechanism) -> No
     assert run.estimator.starts == 2
 
 
-def test_without_a_gate_everything_is_used(paper: Mechanism) -> None:
+def test_without_a_gate_all_samples_are_accepted(paper: Mechanism) -> None:
     run = Run(paper, InitialState())
     run.estimator = Estimator(paper, EstimatorSettings(gate_probability=1.0))
     run.after(100)
@@ -570,7 +578,7 @@ HISTORY_MS = 100
 
 class Delivered:
     """
-    Ticks and measurements of one motion, to be delivered when somebody says.
+    Ticks and measurements of one motion, for delivery with delays.
 
     :ivar ticks: stamp [ns] and wheel speeds of each.
     :ivar samples: stamp [ns], links, angles of each, several per tick or none, between the ticks.
@@ -602,7 +610,7 @@ class Delivered:
         self.samples.insert(0, (start, names_of(0, 1, 2, 3), assemble(mechanism, 0.3, 1.6)))
 
     def estimates(self, mechanism: Mechanism, delays_ns: Array) -> list[Estimate | None]:
-        """Deliver each sample so long after its stamp, in the order in which they arrive."""
+        """Deliver each sample with its delay, in the order of arrival."""
         estimator = Estimator(mechanism, EstimatorSettings())
         arrivals = sorted(
             (stamp + int(delay), n) for n, ((stamp, *_), delay)
@@ -622,7 +630,7 @@ class Delivered:
 def test_estimate_depends_on_what_arrived_and_not_on_when(
     seed: int, mechanism: Mechanism,
 ) -> None:
-    """Delays of up to 0.1 s, each sample its own: what is in at a tick is all that counts."""
+    """Each sample has its own delay of up to 0.1 s; only the set of arrived samples matters."""
     told = Delivered(mechanism, seed)
     rng = np.random.default_rng(seed + 100)
     in_time = told.estimates(mechanism, np.zeros(len(told.samples)))
@@ -631,12 +639,12 @@ def test_estimate_depends_on_what_arrived_and_not_on_when(
     end_ns = told.ticks[-1][0]
     delays = np.minimum(delays, [end_ns - stamp for stamp, *_ in told.samples])
     late = told.estimates(mechanism, delays)
-    final, wanted = late[-1], in_time[-1]
+    final, expected = late[-1], in_time[-1]
     assert final is not None
-    assert wanted is not None
+    assert expected is not None
     for name in ('link_angles', 'link_rates', 'angle_sigmas', 'rate_sigmas'):
         np.testing.assert_allclose(
-            getattr(final, name), getattr(wanted, name), rtol=0.0, atol=1e-12,
+            getattr(final, name), getattr(expected, name), rtol=0.0, atol=1e-12,
             err_msg=f'{name}, seed {seed}')
     # On the way there much was missing, so that the above is no matter of course.
     middle = late[len(late) // 2], in_time[len(late) // 2]
@@ -646,7 +654,7 @@ def test_estimate_depends_on_what_arrived_and_not_on_when(
 
 
 @pytest.mark.parametrize('latency_ms', [1, 5, 40])
-def test_latency_makes_no_error_in_motion(latency_ms: int, mechanism: Mechanism) -> None:
+def test_latency_causes_no_error_in_motion(latency_ms: int, mechanism: Mechanism) -> None:
     """At 5 rad/s the sample of 5 ms ago is off by 25 mrad, ten times what is tolerated."""
     run = Run(mechanism, InitialState(0.3, 1.6, 'open', 5.0, 5.0))
     rng = np.random.default_rng(7)
@@ -673,7 +681,7 @@ def test_latency_makes_no_error_in_motion(latency_ms: int, mechanism: Mechanism)
         assert estimate.innovation is not None
 
 
-def test_sample_as_old_as_the_history_is_taken(running: Run) -> None:
+def test_sample_as_old_as_the_history_is_used(running: Run) -> None:
     running.after(50)
     truth = running.plant.truth().link_angles
     running.ticks(1, ())
@@ -684,15 +692,14 @@ def test_sample_as_old_as_the_history_is_taken(running: Run) -> None:
     assert not running.estimator.rejected
 
 
-def test_sample_that_was_there_is_rejected_however_late(running: Run) -> None:
+def test_late_repeated_sample_is_rejected(running: Run) -> None:
     running.after(20)
-    with pytest.raises(RejectedError) as caught:
+    with rejected('repeated'):
         running.estimator.measure(running.stamp_ns - 5 * PERIOD_NS, ['link_b'], [0.5])
-    assert caught.value.kind == 'repeated'
 
 
-def test_start_from_a_late_sample_is_brought_forward(mechanism: Mechanism) -> None:
-    """Nothing came for ten ticks; the first sample is that old, and the wheels moved since."""
+def test_start_from_a_late_sample_is_predicted_to_the_tick(mechanism: Mechanism) -> None:
+    """The first sample arrives ten ticks late, and the wheels have moved since its stamp."""
     run = Run(mechanism, InitialState(0.3, 1.6), PERFECT)
     first = run.plant.truth().link_angles
     stamp = run.stamp_ns + PERIOD_NS
@@ -709,8 +716,8 @@ def test_start_from_a_late_sample_is_brought_forward(mechanism: Mechanism) -> No
     assert np.abs(run.unwrapped_error(estimate)).max() < 0.11 * moved
 
 
-def test_new_start_in_the_same_run_stays_on_its_turn(paper: Mechanism) -> None:
-    """Lost after two turns, it does not jump back by them: the controller would follow."""
+def test_restart_in_the_same_run_stays_on_its_turn(paper: Mechanism) -> None:
+    """After two turns, a restart does not jump back: the controller would follow."""
     run = Run(paper, InitialState(0.0, 1.0, 'open', 6.0, 6.0), PERFECT)
     before = run.after(600)
     assert before.link_angles.min() > 4.0 * pi
@@ -724,7 +731,7 @@ def test_new_start_in_the_same_run_stays_on_its_turn(paper: Mechanism) -> None:
 # Constant errors, too small for the gate
 
 def named(run: Run, ticks: int, offsets: Array, wrong: int) -> tuple[float, float]:
-    """Let sensors be off; return after what time the wrong one alone is named, and the error."""
+    """Offset sensors; return the time of isolation of the wrong one, and the largest error."""
     after, worst = inf, 0.0
     for n in range(ticks):
         estimate = run.tick(None, None, offsets)
@@ -737,10 +744,10 @@ def named(run: Run, ticks: int, offsets: Array, wrong: int) -> tuple[float, floa
 
 @pytest.mark.parametrize(('degrees', 'seed'), [(0.3, 0), (-0.3, 1), (-0.5, 2)])
 @pytest.mark.parametrize('wrong', range(4))
-def test_small_step_of_a_sensor_is_blamed_on_it(
+def test_small_bias_of_a_sensor_is_isolated(
     wrong: int, degrees: float, seed: int, mechanism: Mechanism,
 ) -> None:
-    """Not on its partner, and the estimate does without it: 0.3 deg are three sigmas."""
+    """Not that of its paired link; the sensor is excluded. 0.3 deg are three sigmas."""
     run = Run(mechanism, InitialState(0.3, 1.6, 'open', 0.3, -0.2), seed=seed)
     run.after(500)
     assert run.estimator.sensor_faults() == {}
@@ -755,11 +762,11 @@ def test_small_step_of_a_sensor_is_blamed_on_it(
     assert estimate.innovation is not None and estimate.innovation.degrees_of_freedom == 4
 
 
-def test_pair_is_named_where_one_cannot_be_told_from_its_partner(paper: Mechanism) -> None:
+def test_both_sensors_are_suspected_where_neither_can_be_isolated(paper: Mechanism) -> None:
     """
-    Opposite links that were off by the same from the start, one up and one down.
+    Sensors of paired links have opposite offsets from the start.
 
-    Nothing tells which of the two is right: the filter never saw another thing.
+    The filter did not observe the onset, so it cannot isolate one of them.
     """
     run = Run(paper, InitialState(0.3, 1.6))
     for _ in range(1000):
@@ -767,16 +774,16 @@ def test_pair_is_named_where_one_cannot_be_told_from_its_partner(paper: Mechanis
     faults = run.estimator.sensor_faults()
     assert set(faults) == {'link_a', 'link_c'}
     assert faults['link_a'].endswith('or link_c is')
-    suspicion = run.estimator.suspicion()
-    assert abs(suspicion['link_a'] - suspicion['link_c']) < 10.0
-    assert min(suspicion['link_a'], suspicion['link_c']) > 20.0 > suspicion['link_b']
+    statistics = run.estimator.glr_statistics()
+    assert abs(statistics['link_a'] - statistics['link_c']) < 10.0
+    assert min(statistics['link_a'], statistics['link_c']) > 20.0 > statistics['link_b']
     # Both are used on: the mean of the two is the best that there is.
     (estimate,) = run.ticks(1)
     assert estimate.innovation is not None and estimate.innovation.degrees_of_freedom == 4
 
 
-def test_sensor_that_nothing_can_replace_is_named_and_used(paper: Mechanism) -> None:
-    """The heading beside joint encoders: without it nobody knows where the whole points."""
+def test_indispensable_sensor_is_reported_and_used(paper: Mechanism) -> None:
+    """The heading beside joint encoders: no other sensor measures the orientation."""
     run = Run(paper, InitialState(0.3, 1.6), joint_encoders('link_a'))
     run.after(500)
     offsets = np.radians(0.3) * np.eye(5)[4]
@@ -795,7 +802,7 @@ GYROS = replace(REAL, link_sensors=replace(
     REAL.link_sensors, gyro=True, gyro_noise_rms=5e-3, gyro_bias=(0.05, -0.03, 0.0, 0.1)))
 
 
-def test_biases_of_gyros_are_found(mechanism: Mechanism) -> None:
+def test_biases_of_gyros_are_estimated(mechanism: Mechanism) -> None:
     run = Run(mechanism, InitialState(0.3, 1.6, 'open', 0.5, -0.3), GYROS)
     estimate = run.after(1000)
     assert list(estimate.gyro_biases) == [0, 1, 2, 3]
@@ -805,8 +812,8 @@ def test_biases_of_gyros_are_found(mechanism: Mechanism) -> None:
     assert (np.abs(run.error(estimate)[4:]) < SIGMAS * estimate.rate_sigmas).all()
 
 
-def test_gyros_make_the_rate_known_sooner(paper: Mechanism) -> None:
-    """With biases that are known by then, after something hit the linkage."""
+def test_gyros_reduce_the_sigma_of_the_rate(paper: Mechanism) -> None:
+    """With converged biases, and unknown torques on the linkage."""
     sigmas = []
     for table in (REAL, GYROS):
         run = Run(paper, InitialState(0.3, 1.6), table)
@@ -816,17 +823,16 @@ def test_gyros_make_the_rate_known_sooner(paper: Mechanism) -> None:
 
 
 def test_gyro_that_is_not_finite_is_rejected_with_its_message(running: Run) -> None:
-    with pytest.raises(RejectedError) as caught:
+    with rejected('finite'):
         running.estimator.measure(
             running.stamp_ns + 1, list(LINK_NAMES), [0.0] * 4, [0.0, nan, 0.0, 0.0])
-    assert caught.value.kind == 'finite'
 
 
 # Wheels that are not measured
 
-@pytest.mark.parametrize('way', ['wheel efforts', 'commanded efforts'])
-def test_without_speeds_the_efforts_drive_it(way: str, paper: Mechanism) -> None:
-    """Said, and less sure of the rates, but through a motion that it would lose without them."""
+@pytest.mark.parametrize('source', ['wheel efforts', 'commanded efforts'])
+def test_without_speeds_the_efforts_drive_the_prediction(source: str, paper: Mechanism) -> None:
+    """Reported, and with larger sigmas of the rates, in a motion driven by the motors."""
     table = replace(REAL, wheel_encoders=WheelEncoders(0))
     run = Run(paper, InitialState(0.3, 1.6), table)
     sure = run.after(500).rate_sigmas
@@ -839,12 +845,12 @@ def test_without_speeds_the_efforts_drive_it(way: str, paper: Mechanism) -> None
         reading, = run.plant.link_sensors.due(run.stamp_ns)
         run.estimator.measure(run.stamp_ns, LINK_NAMES, list(reading.angles))
         efforts = run.plant.efforts.copy()
-        if way == 'commanded efforts':
-            run.estimator.commanded(list(efforts))
+        if source == 'commanded efforts':
+            run.estimator.set_command(list(efforts))
             efforts = np.empty(0)
         estimate = run.estimator.tick(run.stamp_ns, [], list(efforts))
         assert estimate is not None
-        assert run.estimator.driven_by == way
+        assert run.estimator.driven_by == source
         worst = max(worst, float(np.abs(run.error(estimate)[4:]).max()))
     assert (estimate.rate_sigmas > 1.5 * sure).all()
     # 5e-5 N m move a pair of links by 0.3 rad/s^2, a half turn of the sine by 0.05 rad/s.
@@ -853,7 +859,7 @@ def test_without_speeds_the_efforts_drive_it(way: str, paper: Mechanism) -> None
     assert run.estimator.driven_by == 'wheel speeds'
 
 
-def test_without_anything_of_the_wheels_that_is_said(paper: Mechanism) -> None:
+def test_missing_wheel_motion_is_reported(paper: Mechanism) -> None:
     run = Run(paper, InitialState(0.3, 1.6))
     run.after(250)
     estimate = run.estimator.tick(run.stamp_ns + PERIOD_NS, [])
@@ -861,8 +867,8 @@ def test_without_anything_of_the_wheels_that_is_said(paper: Mechanism) -> None:
     assert run.estimator.driven_by == 'nothing'
 
 
-def test_old_commands_do_not_count(running: Run) -> None:
-    running.estimator.commanded([1e-5] * 4)
+def test_old_commands_are_ignored(running: Run) -> None:
+    running.estimator.set_command([1e-5] * 4)
     driven = []
     for n in range(1, 30):
         running.estimator.tick(running.stamp_ns + n * PERIOD_NS, [])
@@ -871,48 +877,55 @@ def test_old_commands_do_not_count(running: Run) -> None:
 
 
 @pytest.mark.parametrize('efforts', [[0.0] * 3, [nan, 0.0, 0.0, 0.0], [inf] * 4])
-def test_commands_of_no_use_are_left_alone(efforts: list[float], running: Run) -> None:
-    running.estimator.commanded(efforts)
+def test_unusable_commands_are_ignored(efforts: list[float], running: Run) -> None:
+    running.estimator.set_command(efforts)
     assert running.estimator.tick(running.stamp_ns + PERIOD_NS, []) is not None
     assert running.estimator.driven_by == 'nothing'
 
 
 # Disturbances
 
-def test_constant_torques_are_found(paper: Mechanism) -> None:
-    """On link c it is one on its partner a."""
-    run = Run(paper, InitialState(0.3, 1.6))
-    run.estimator = Estimator(paper, EstimatorSettings(disturbance_walk=3e-7))
-    given = np.array([2e-6, -1e-6, 1e-6, 0.0])
-    run.plant._around['link_torques'] = given
-    run.plant._around['acting'] = True
-    estimate = run.after(1500)
+def test_constant_torques_are_estimated(paper: Mechanism) -> None:
+    """A torque on link c acts as one on its paired link a."""
+    estimator = Estimator(paper, EstimatorSettings(disturbance_walk=3e-7))
+    around = surroundings(link_torques=[2e-6, -1e-6, 1e-6, 0.0])
+    rng = np.random.default_rng(0)
+    state, speeds = make_state(assemble(paper, 0.3, 1.6)), np.zeros(4)
+    for n in range(1, 1501):
+        before = speeds
+        move_held(state, np.zeros(4), 5e-4, 8, paper.constants, around)
+        speeds = state[WHEEL_SPEEDS] - state[LINK_RATES]
+        stamp_ns = FIRST_NS + n * PERIOD_NS
+        estimator.measure(stamp_ns, list(LINK_NAMES),
+                          list(state[LINK_ANGLES] + NOISE * rng.standard_normal(4)))
+        estimate = estimator.tick(stamp_ns, 0.5 * (before + speeds))
+    assert estimate is not None
     error = estimate.disturbance - [3e-6, -1e-6]
     assert (np.abs(error) < SIGMAS * estimate.disturbance_sigmas).all()
     assert (estimate.disturbance_sigmas < 1e-6).all()
 
 
-# Decisions
+# Sample statuses
 
-def test_every_sensor_has_its_decision_at_every_tick(running: Run) -> None:
-    """Accepted, gated, late, not finite, no data; by name, with the square of the innovation."""
+def test_every_sensor_has_a_status_at_every_tick(running: Run) -> None:
+    """Accepted, gated, late, not finite, no data; by name, with the NIS."""
     def decided(estimate: Estimate | None) -> dict[str, str]:
         assert estimate is not None
-        return {LINK_NAMES[decision.sensor]: DECISIONS[decision.reason]
-                for decision in running.estimator.decisions()}
-    everybody = dict.fromkeys(LINK_NAMES, 'accepted')
+        return {LINK_NAMES[status.sensor]: SAMPLE_STATUSES[status.status]
+                for status in running.estimator.sample_statuses()}
+    accepted = dict.fromkeys(LINK_NAMES, 'accepted')
     (estimate,) = running.ticks(1)
-    assert decided(estimate) == everybody
+    assert decided(estimate) == accepted
     assert decided(running.tick((0, 2))) == {
-        **everybody, 'link_b': 'no data', 'link_d': 'no data'}
+        **accepted, 'link_b': 'no data', 'link_d': 'no data'}
     far_off = running.tick(None, None, 0.5 * np.eye(4)[3])
-    assert decided(far_off) == {**everybody, 'link_d': 'gated'}
-    assert running.estimator.decisions()[3].square > EstimatorSettings().gate
+    assert decided(far_off) == {**accepted, 'link_d': 'gated'}
+    assert running.estimator.sample_statuses()[3].nis > EstimatorSettings().gate
     for stamp_ns, angle, reason in ((running.stamp_ns - 200_000_000, 0.3, 'late'),
                                     (running.stamp_ns + 1, nan, 'not finite')):
         with pytest.raises(RejectedError):
             running.estimator.measure(stamp_ns, ['link_b'], [angle])
-        assert decided(running.tick((0, 2, 3))) == {**everybody, 'link_b': reason}
+        assert decided(running.tick((0, 2, 3))) == {**accepted, 'link_b': reason}
 
 
 def test_measurements_of_the_future_are_counted(running: Run) -> None:
@@ -924,9 +937,9 @@ def test_measurements_of_the_future_are_counted(running: Run) -> None:
 
 @pytest.mark.parametrize(('lag', 'fault'), [(12, 'samples come late'),
                                             (40, 'samples come too late')])
-def test_sensor_that_lags_behind_the_others_is_named(lag: int, fault: str, paper: Mechanism
+def test_slow_sensor_is_reported(lag: int, fault: str, paper: Mechanism
                                                      ) -> None:
-    """Its samples are used at their stamps as long as they can be."""
+    """Its samples act at their stamps within the history."""
     run = Run(paper, InitialState(0.3, 1.6, 'open', 0.5, -0.3))
     run.after(250)
     late: list[tuple[int, float]] = []

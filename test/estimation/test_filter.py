@@ -6,8 +6,9 @@
 from dataclasses import dataclass, replace
 
 from filterpy.kalman import ExtendedKalmanFilter
-from fourbar_ros.estimation.filter import GYROS, LinkageFilter, ProcessNoise
-from fourbar_ros.estimation.filter_state import FREE
+from fourbar_ros.estimation.filter import LinkageFilter
+from fourbar_ros.estimation.filter_model import ProcessNoise
+from fourbar_ros.estimation.filter_state import FREE, GYROS
 from fourbar_ros.mechanism import assemble, Mechanism, nearest_assembly, reduced_form
 from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.mechanism.forces import NOTHING
@@ -58,7 +59,7 @@ def independent_end(mechanism: Mechanism, start: Array, guess: Array, torques: A
 
 
 def set_rates(linkage: LinkageFilter, mechanism: Mechanism, rates: Array) -> None:
-    """Let links a and b have these rates, and the others what the closure makes of them."""
+    """Set the rates of links a and b, and those of c and d by the closure."""
     gamma = reduced_form(mechanism, linkage.angles, rates).gamma
     linkage.x[4:8] = np.concatenate([rates, gamma @ rates])
 
@@ -73,7 +74,7 @@ def test_prediction_and_transition_are_those_of_the_linkage(
     start = np.array([0.4, 1.7, 2.0, -1.5])
     linkage = LinkageFilter(mechanism, angles, 1e-6, 1e-4, ProcessNoise(0.0))
     set_rates(linkage, mechanism, start[2:])
-    linkage.move(duration, torques)
+    linkage.predict(duration, torques)
     # One step of order four. Its scale is twice the relative rate of 3.5 rad/s (products of two
     # sines) over the sine of the fold; for the short step it is the integrator's tolerance.
     model = (7.0 / abs(np.sin(angles[3] - angles[2])) * duration) ** 5 / 120.0
@@ -92,7 +93,7 @@ def test_prediction_and_transition_are_those_of_the_linkage(
 
 
 def test_wheel_motion_predicts_the_plant(mechanism: Mechanism) -> None:
-    """Motor torques are nowhere in the filter: what the wheels did tells what the links did."""
+    """Without motor torques: the motion of the wheels determines that of the links."""
     plant = Plant(mechanism, Table(LinkSensorSettings(), WheelEncoders(0)),
                   InitialState(0.3, 1.6, 'open', 1.0, -0.5), 5e-4, np.random.default_rng(0))
     truth = plant.truth()
@@ -103,7 +104,7 @@ def test_wheel_motion_predicts_the_plant(mechanism: Mechanism) -> None:
         before = plant.truth().wheel_speeds
         plant.advance(8, rng.uniform(-1e-4, 1e-4, 4))
         change = plant.truth().wheel_speeds - before
-        linkage.move(PERIOD, mechanism.flywheel_inertias * change / PERIOD)
+        linkage.predict(PERIOD, mechanism.flywheel_inertias * change / PERIOD)
     truth = plant.truth()
     # Momentum is exact at every tick. The wheels' evenness within one is not: alpha changes by
     # less than 10 rad/s^3 * 4 ms, of which If/I = 2 % counts, over 0.2 s.
@@ -128,7 +129,7 @@ class Consistency:
 
 def monte_carlo(mechanism: Mechanism, seed: int) -> Consistency:
     """
-    Run the filter on exactly the world that it assumes.
+    Run the filter on a linkage that fulfils its assumptions exactly.
 
     White torques on each link, white noise on four angles, a start drawn from its covariance.
     """
@@ -153,10 +154,10 @@ def monte_carlo(mechanism: Mechanism, seed: int) -> Consistency:
             for _ in range(2):
                 disturbed = wheels + DISTURBANCE / np.sqrt(PERIOD / 2) * rng.standard_normal(4)
                 move_held(state, disturbed, PERIOD / 2, 1, constants, NOTHING)
-            linkage.move(PERIOD, wheels)
-            seen = linkage.correct(
+            linkage.predict(PERIOD, wheels)
+            seen = linkage.update(
                 ALL, state[:4] + NOISE * rng.standard_normal(4), NOISE ** 2)
-            innovation, nis[run, tick] = seen.innovation, seen.nis
+            innovation, nis[run, tick] = seen.values, seen.nis
             whitened[run, tick] = np.linalg.solve(np.linalg.cholesky(linkage.S), innovation)
             error = linkage.x[FREE] - state[[0, 1, 4, 5]]
             errors[run, tick] = error
@@ -199,7 +200,7 @@ def test_estimates_are_without_bias(consistency: Consistency) -> None:
 
 
 def test_innovations_are_white(consistency: Consistency) -> None:
-    """Whitened innovations of one tick do not tell those of the next ten, in any pair of links."""
+    """Whitened innovations do not correlate with those of the next ten ticks, for any links."""
     white = consistency.whitened
     total = 0.0
     for lag in range(1, 11):
@@ -209,7 +210,7 @@ def test_innovations_are_white(consistency: Consistency) -> None:
     assert low < total < high
 
 
-def test_sigmas_of_all_four_links_are_those_of_their_errors(consistency: Consistency) -> None:
+def test_sigmas_of_all_four_links_agree_with_their_errors(consistency: Consistency) -> None:
     """For c and d, which follow by closure, as well as for a and b."""
     # Eight numbers share the 5 %, hence the wider interval.
     low, high = (bound / RUNS for bound in stats.chi2.interval(1.0 - 0.05 / 8.0, RUNS))
@@ -218,7 +219,7 @@ def test_sigmas_of_all_four_links_are_those_of_their_errors(consistency: Consist
     assert (ratio < high).all()
 
 
-def test_measuring_makes_the_filter_surer(consistency: Consistency) -> None:
+def test_measurements_reduce_the_sigmas(consistency: Consistency) -> None:
     angle, rate = consistency.sigmas[:, -1, :2], consistency.sigmas[:, -1, 4:6]
     assert (angle < NOISE / 2.0).all()
     assert (rate < START_RATE / 2.0).all()
@@ -226,10 +227,10 @@ def test_measuring_makes_the_filter_surer(consistency: Consistency) -> None:
 
 # Single corrections
 
-def test_sigma_of_a_parallel_link_is_that_of_its_partner(paper: Mechanism) -> None:
+def test_paired_links_have_equal_sigmas(paper: Mechanism) -> None:
     linkage = LinkageFilter(paper, assemble(paper, 0.2, 1.5), 4e-6, 1e-2, QUIET)
-    linkage.correct((1,), linkage.angles[1:2], 1e-6)
-    linkage.move(PERIOD, np.zeros(4))
+    linkage.update((1,), linkage.angles[1:2], 1e-6)
+    linkage.predict(PERIOD, np.zeros(4))
     sigmas = linkage.sigmas()[:8].reshape(2, 4)
     np.testing.assert_allclose(sigmas[:, 2:], sigmas[:, :2], rtol=1e-8)
     assert sigmas[0, 1] < 0.6 * sigmas[0, 0]
@@ -240,8 +241,8 @@ def test_sigma_follows_the_closure(uneven: Mechanism) -> None:
     angles = assemble(uneven, 0.2, 1.5)
     linkage = LinkageFilter(uneven, angles, 4e-6, 1e-2, QUIET)
     set_rates(linkage, uneven, np.array([1.0, -2.0]))
-    linkage.correct((1, 2), angles[1:3], 1e-6)
-    linkage.move(PERIOD, np.zeros(4))
+    linkage.update((1, 2), angles[1:3], 1e-6)
+    linkage.predict(PERIOD, np.zeros(4))
 
     def follow(x: Array) -> Array:
         found = nearest_assembly(uneven, (0, 1), (x[0], x[1]), linkage.angles)
@@ -263,47 +264,47 @@ def test_turn_of_a_measurement_does_not_matter(turns: int, mechanism: Mechanism)
     ends = []
     for offset in (0.0, 2.0 * np.pi * turns):
         linkage = LinkageFilter(mechanism, angles, 1e-6, 1e-4, QUIET)
-        linkage.correct(ALL, measured + offset, 1e-6)
+        linkage.update(ALL, measured + offset, 1e-6)
         ends.append(linkage.angles)
     # 50 turns have a rounding of 6e-14.
     np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=1e-12)
 
 
-def test_measured_link_tells_its_partner(paper: Mechanism) -> None:
-    """A link that never gives a sample is known through the closure."""
+def test_measured_link_determines_its_paired_link(paper: Mechanism) -> None:
+    """The closure determines a link without samples."""
     angles = assemble(paper, 0.2, 1.5)
     target = assemble(paper, 0.25, 1.45)
     linkage = LinkageFilter(paper, angles, 1e-2, 1e-4, QUIET)
     for _ in range(100):
-        linkage.correct((2, 3), target[2:], 1e-6)
+        linkage.update((2, 3), target[2:], 1e-6)
     # What the prior of 0.1 rad still weighs after a hundred samples of 1 mrad: 1e-6 of 0.05 rad.
     np.testing.assert_allclose(linkage.angles, target, rtol=0.0, atol=1e-7)
 
 
 @pytest.mark.parametrize('wrong', [(0,), (1, 2), (0, 3)], ids=str)
-def test_gate_leaves_out_what_is_far_off_and_nothing_else(
+def test_gate_rejects_outliers_only(
     wrong: tuple[int, ...], uneven: Mechanism,
 ) -> None:
-    """The rest does what it would do alone."""
+    """The accepted samples have the effect that they have alone."""
     angles = assemble(uneven, 0.2, 1.5)
     measured = angles + [1e-3, -1e-3, 2e-3, 0.0]
     right = tuple(link for link in ALL if link not in wrong)
     gated, alone = (LinkageFilter(uneven, angles, 1e-6, 1e-4, QUIET) for _ in range(2))
-    nis = alone.correct(right, measured[list(right)], 1e-6).nis
+    nis = alone.update(right, measured[list(right)], 1e-6).nis
     measured[list(wrong)] += 0.1
-    seen = gated.correct(ALL, measured, 1e-6, gate=15.0)
+    seen = gated.update(ALL, measured, 1e-6, gate=15.0)
     assert seen.used.tolist() == [link in right for link in ALL]
     assert seen.nis == pytest.approx(nis, rel=1e-12)
-    np.testing.assert_allclose(seen.innovation, measured - angles, rtol=1e-12)
+    np.testing.assert_allclose(seen.values, measured - angles, rtol=1e-12)
     np.testing.assert_allclose(gated.x, alone.x, rtol=1e-14)
     np.testing.assert_allclose(gated.P, alone.P, rtol=1e-12, atol=1e-20)
 
 
-def test_nothing_within_the_gate_changes_nothing(paper: Mechanism) -> None:
+def test_update_without_accepted_samples_changes_nothing(paper: Mechanism) -> None:
     angles = assemble(paper, 0.2, 1.5)
     linkage = LinkageFilter(paper, angles, 1e-6, 1e-4, QUIET)
     before = linkage.snapshot()[:3]
-    seen = linkage.correct(ALL, angles + 0.5, 1e-6, gate=15.0)
+    seen = linkage.update(ALL, angles + 0.5, 1e-6, gate=15.0)
     assert seen.nis == 0.0 and not seen.used.any()
     for then, now in zip(before, linkage.snapshot()):
         assert then.tobytes() == now.tobytes()
@@ -321,15 +322,34 @@ SEEN = [(0, 1, 2, 3), (0, 2), (3,), (1, 4, 5, 6, 7), (4, 6), (0, 1, GYROS, GYROS
         (2, 5, GYROS + 2, GYROS + 5)]
 
 
+def random_linkage(rng: np.random.Generator) -> Mechanism:
+    """Return a linkage that closes for any angle of 0.9 to 1.3 rad between links a and b."""
+    lengths = rng.uniform(0.09, 0.12, 4)
+    return Mechanism(
+        lengths, rng.uniform(0.01, 0.05, 4), rng.uniform(1e-5, 5e-5, 4),
+        np.column_stack([rng.uniform(0.2, 0.8, 4) * lengths, rng.uniform(-0.02, 0.02, 4)]),
+        rng.uniform(2e-7, 6e-7, 4))
+
+
+def test_filter_is_a_filterpy_filter(paper: Mechanism) -> None:
+    """The class that is imported alone is the one that others import from filterpy."""
+    linkage = LinkageFilter(paper, assemble(paper, 0.2, 1.5), 1e-4, 1e-4, QUIET)
+    assert isinstance(linkage, ExtendedKalmanFilter)
+
+
 @pytest.mark.parametrize('sensors', SEEN, ids=str)
+@pytest.mark.parametrize('kind', ['paper', 'uneven', 'random'])
 @pytest.mark.parametrize('seed', range(5))
 def test_compiled_steps_are_those_of_filterpy(
-    sensors: tuple[int, ...], seed: int, mechanism: Mechanism,
+    sensors: tuple[int, ...], kind: str, seed: int, request: pytest.FixtureRequest,
 ) -> None:
-    """Predict and correct once, and let filterpy do the same with the same matrices."""
+    """Predict and update once, and let filterpy do the same with the same matrices."""
     rng = np.random.default_rng(seed)
+    mechanism = random_linkage(rng) if kind == 'random' else request.getfixturevalue(kind)
+    angle = rng.uniform(-np.pi, np.pi)
     linkage = LinkageFilter(
-        mechanism, assemble(mechanism, 3.0, 4.3), 1e-4, 1e-2, ProcessNoise(1e-5, 1e-5, 1e-3))
+        mechanism, assemble(mechanism, angle, angle + rng.uniform(0.9, 1.3)), 1e-4, 1e-2,
+        ProcessNoise(1e-5, 1e-5, 1e-3))
     rows = np.zeros((len(sensors), 10 + sum(sensor >= GYROS for sensor in sensors)))
     # Joints 1 to 4: b to a, c to b, d to c, a to d.
     of_links = np.vstack([np.eye(4), np.roll(np.eye(4), 1, axis=1) - np.eye(4)])
@@ -341,30 +361,43 @@ def test_compiled_steps_are_those_of_filterpy(
             row[4:8] = of_links[sensor - GYROS]
             row[bias] = 1.0
             bias += 1
-    # Hear of the gyros before they matter.
-    linkage.correct(sensors, np.zeros(len(sensors)), 1.0, gate=0.0)
+    # Gated samples add the biases of the gyros to the state, and change nothing else.
+    linkage.update(sensors, np.zeros(len(sensors)), 1.0, gate=0.0)
     textbook = textbook_of(linkage, len(sensors))
-    linkage.move(PERIOD, mechanism.flywheel_inertias * rng.normal(size=4))
+    prior = linkage.P.copy()
+    linkage.predict(PERIOD, mechanism.flywheel_inertias * rng.normal(size=4))
     textbook.F, textbook.Q = linkage.F, linkage.Q
     textbook.predict()
-    np.testing.assert_allclose(linkage.P, textbook.P, rtol=1e-12, atol=1e-20)
+    # Each element is a sum of n^2 products of three, in another order: n^2 + 3 roundings of its
+    # absolute sum (Higham, Accuracy and Stability of Numerical Algorithms, 3.1), on both sides.
+    size, epsilon = len(linkage.x), np.finfo(float).eps
+    bound = np.abs(linkage.F) @ np.abs(prior) @ np.abs(linkage.F.T) + np.abs(linkage.Q)
+    assert (np.abs(linkage.P - textbook.P) <= (size ** 2 + 3) * epsilon * bound).all()
 
-    # From here on the same state, which the linkage moves better than F alone.
-    textbook.x = linkage.x.copy()
+    # From here on the same state: the kernel integrates the motion, which F only linearises.
+    textbook.x, textbook.P = linkage.x.copy(), linkage.P.copy()
     predicted = rows @ linkage.x
     measured = predicted + rng.normal(scale=1e-3, size=len(sensors))
     measured[np.array(sensors) < GYROS] -= 2.0 * np.pi
     variances = rng.uniform(1e-6, 5e-6, len(sensors))
+    prior_of_update = linkage.P.copy()
     textbook.update(
         measured, lambda x: rows, lambda x: predicted, R=np.diag(variances),
         residual=lambda z, h: wrap_angles(z - h))
-    seen = linkage.correct(sensors, measured, variances)
+    seen = linkage.update(sensors, measured, variances)
     assert seen.used.all()
-    np.testing.assert_allclose(seen.innovation, textbook.y, rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(seen.values, textbook.y, rtol=0.0, atol=1e-14)
     # Links c and d follow a and b by more than the first order.
     free = [0, 1, 4, 5, *range(8, len(linkage.x))]
-    np.testing.assert_allclose(linkage.x[free], textbook.x[free], rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(linkage.K, textbook.K, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(linkage.P, textbook.P, rtol=1e-12, atol=1e-18)
+    # The inverse of S amplifies rounding by its condition. P, K and x are sums of n products, of
+    # the scales of the prior covariance, of the largest gain, and of the angles of a turn.
+    rounding = size ** 2 * epsilon * np.linalg.cond(linkage.S)
+    gain = np.abs(textbook.K).max()
+    np.testing.assert_allclose(linkage.K, textbook.K, rtol=0.0, atol=rounding * gain)
+    np.testing.assert_allclose(linkage.x[free], textbook.x[free], rtol=0.0,
+                               atol=rounding * (gain * 1e-2 + 2.0 * np.pi))
+    variance = prior_of_update.diagonal()
+    scale = np.sqrt(np.outer(variance, variance))
+    assert (np.abs(linkage.P - textbook.P) <= rounding * scale).all()
     # Wrapping by a turn leaves 1e-15 rad of innovations of 1e-3 rad.
     assert seen.nis == pytest.approx(textbook.mahalanobis ** 2, rel=1e-11)

@@ -1,13 +1,13 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The estimator behind its topics says what the estimator says."""
+"""The messages of the estimator agree with its estimates."""
 
 from dataclasses import fields
 
 from fourbar_ros.estimation import Estimator, EstimatorSettings
-from fourbar_ros.estimation.parameters import PARAMETERS, SETTINGS
-from fourbar_ros.estimation.topics import Answer, EstimatorTopics, INPUTS, OUTPUTS
+from fourbar_ros.estimation.estimator_settings import PARAMETERS, SETTINGS
+from fourbar_ros.estimation.estimator_topics import EstimatorTopics, INPUTS, OUTPUTS, Response
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism
 import numpy as np
 import pytest
@@ -24,12 +24,12 @@ def topics(paper: Mechanism) -> EstimatorTopics:
     return EstimatorTopics(paper, EstimatorSettings())
 
 
-def tick(topics: EstimatorTopics, number: int, speed: float = 0.0) -> Answer:
+def tick(topics: EstimatorTopics, number: int, speed: float = 0.0) -> Response:
     return topics.receive('flywheel_states', number * TICK_NS, FLYWHEEL_NAMES, [0.0] * 4,
                           [speed] * 4, [0.0] * 4)
 
 
-def sample(topics: EstimatorTopics, number: int) -> Answer:
+def sample(topics: EstimatorTopics, number: int) -> Response:
     return topics.receive('link_angles', number * TICK_NS, LINK_NAMES, ANGLES, GYROS, [])
 
 
@@ -44,10 +44,10 @@ def test_tick_without_estimate_is_answered(topics: EstimatorTopics) -> None:
     assert (message.topic, message.stamp_ns) == ('estimate/waiting', TICK_NS)
 
 
-def test_everything_of_an_estimate_is_said(topics: EstimatorTopics, paper: Mechanism) -> None:
+def test_messages_carry_the_whole_estimate(topics: EstimatorTopics, paper: Mechanism) -> None:
     plain = Estimator(paper, EstimatorSettings())
     for number in (1, 2):
-        assert sample(topics, number) == Answer()
+        assert sample(topics, number) == Response()
         plain.measure(number * TICK_NS, LINK_NAMES, ANGLES, GYROS)
         answer, estimate = tick(topics, number, 0.1), plain.tick(number * TICK_NS, [0.1] * 4)
     assert estimate is not None
@@ -71,14 +71,14 @@ def test_everything_of_an_estimate_is_said(topics: EstimatorTopics, paper: Mecha
     assert said['estimate/gyro_bias'].values[0].tolist() == list(estimate.gyro_biases.values())
     reasons, squares, freedom = said['estimate/decisions'].values
     assert reasons.tolist() == [0.0] * 4 and freedom.tolist() == [1.0] * 4
-    assert squares.tolist() == [decision.square for decision in plain.decisions()]
+    assert squares.tolist() == [status.nis for status in plain.sample_statuses()]
     covariance = dict(zip(said['estimate/covariance'].names,
                           said['estimate/covariance'].values[0], strict=True))
     assert covariance['phi_b.phi_b'] == estimate.covariance[1, 1]
     assert covariance['phi_a.omega_b'] == estimate.covariance[0, 3]
 
 
-def test_tick_that_comes_again_gets_the_same_answer(topics: EstimatorTopics) -> None:
+def test_repeated_tick_gets_the_same_response(topics: EstimatorTopics) -> None:
     sample(topics, 1)
     first, second = (list(tick(topics, 1).messages) for _ in range(2))
     assert [message[:3] for message in first] == [message[:3] for message in second]
@@ -88,7 +88,7 @@ def test_tick_that_comes_again_gets_the_same_answer(topics: EstimatorTopics) -> 
 
 
 @pytest.mark.parametrize('topic', INPUTS)
-def test_what_is_of_no_use_is_told(topics: EstimatorTopics, topic: str) -> None:
+def test_rejection_is_in_the_response(topics: EstimatorTopics, topic: str) -> None:
     answer = topics.receive(topic, TICK_NS, ['link_x'], [0.0], [0.0], [0.0])
     assert answer.rejection == topics.estimator.last_rejection != ''
     # A tick is answered all the same: a lock-step waits for it.
@@ -96,7 +96,7 @@ def test_what_is_of_no_use_is_told(topics: EstimatorTopics, topic: str) -> None:
         ['estimate/waiting'] if topic == 'flywheel_states' else [])
 
 
-def test_commands_stand_in_where_ticks_say_nothing_of_the_wheels(topics: EstimatorTopics) -> None:
+def test_commands_replace_missing_wheel_motion(topics: EstimatorTopics) -> None:
     def silent_tick(number: int) -> None:
         topics.receive('flywheel_states', number * TICK_NS, FLYWHEEL_NAMES, [], [], [])
     sample(topics, 1)
@@ -106,7 +106,7 @@ def test_commands_stand_in_where_ticks_say_nothing_of_the_wheels(topics: Estimat
     silent_tick(3)
     assert topics.needs_commands
     assert topics.receive('flywheel_command', 3 * TICK_NS, FLYWHEEL_NAMES, [], [], [1e-6] * 4
-                          ) == Answer()
+                          ) == Response()
     silent_tick(4)
     assert topics.estimator.driven_by == 'commanded efforts'
     assert topics.needs_commands

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-At change points the filter knows what it does not know, and the sensors tell the branch.
+At change points the sigmas cover the errors, and the sensors determine the branch.
 
 The prototype's linkage has equal opposite links: at theta = phi_b - phi_a = 0 and pi all four lie
 on a line, and psi = phi_c - phi_a is free there besides theta.
@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from fourbar_ros.estimation import Estimate, Estimator, EstimatorSettings
-from fourbar_ros.estimation.filter import LinkageFilter, ProcessNoise
+from fourbar_ros.estimation.filter import LinkageFilter
+from fourbar_ros.estimation.filter_model import ProcessNoise
 from fourbar_ros.mechanism import load_mechanism, Mechanism
 from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.mechanism.forces import NOTHING
@@ -30,7 +31,7 @@ PERIOD = 4e-3
 NOISE = 1.7453e-3
 SETTINGS = EstimatorSettings(
     angle_noise=NOISE, counts_per_turn=0, disturbance_torque=1e-5, disturbance_walk=1e-5)
-# A thousand numbers exceed 5 sigma with p = 0.0006, if all is well.
+# Bound of errors in sigmas: one of a thousand normal numbers exceeds 5 with p = 0.0006.
 SIGMAS = 5.0
 SEEDS = range(3)
 
@@ -42,7 +43,7 @@ def mechanism() -> Mechanism:
 
 
 class Moment(NamedTuple):
-    """What is at a tick: angles and rates of the links in truth, and what is thought of them."""
+    """True angles and rates of the links at a tick, and their estimate."""
 
     angles: Array
     rates: Array
@@ -59,7 +60,7 @@ class Moment(NamedTuple):
 def watch(mechanism: Mechanism, angles: Array, rates: Array, torques: Callable[[float], Array],
           seconds: float, seed: int, sensors: tuple[int, ...] = (0, 1, 2, 3)
           ) -> tuple[Estimator, Iterator[Moment]]:
-    """Let the linkage go from anywhere, also from change points, and an estimator watch it."""
+    """Estimate the motion of a linkage from any state, also from change points."""
     rng = np.random.default_rng(seed)
     estimator = Estimator(mechanism, SETTINGS)
     names = [('link_a', 'link_b', 'link_c', 'link_d')[sensor] for sensor in sensors]
@@ -86,7 +87,7 @@ def at_rest(_: float) -> Array:
 
 
 def settled(estimator: Estimator, moments: Iterator[Moment], seed: int) -> list[Moment]:
-    """Go through all; errors must stay within their sigmas, NIS be that of noise."""
+    """Check that errors stay within their sigmas and that NIS is that of noise."""
     everything = list(moments)[100:]
     deviations = np.array([moment.deviations() for moment in everything])
     assert np.abs(deviations).max() < SIGMAS, f'seed {seed}'
@@ -126,43 +127,43 @@ def test_folding_at_a_change_point_is_followed(seed: int, mechanism: Mechanism) 
 
 @pytest.mark.parametrize('seed', SEEDS)
 @pytest.mark.parametrize('theta', [0.0, 0.002, 0.05, np.pi - 0.01])
-def test_start_at_or_near_one(seed: int, theta: float, mechanism: Mechanism) -> None:
-    """From what is measured, while the whole turns."""
+def test_start_at_or_near_a_change_point(seed: int, theta: float, mechanism: Mechanism) -> None:
+    """From measurements, while the whole rotates."""
     angles = 0.2 + theta * np.array([0.0, 1.0, 0.0, 1.0])
     settled(*watch(mechanism, angles, np.full(4, 0.3), at_rest, 2.0, seed), seed)
 
 
-def test_three_sensors_are_enough(mechanism: Mechanism) -> None:
-    """Where three motions are free, three angles tell them."""
+def test_three_sensors_determine_three_free_motions(mechanism: Mechanism) -> None:
+    """At a change point three motions are free."""
     angles = 0.2 - 0.3 * np.array([0.0, 1.0, 0.0, 1.0])
     settled(*watch(mechanism, angles, 0.5 * np.array([0.0, 1.0, 0.0, 1.0]), at_rest, 1.5, 1,
                    (0, 1, 3)), 1)
 
 
-def test_free_motion_is_known_less_well_where_nothing_constrains_it(mechanism: Mechanism) -> None:
-    """With two sensors at theta = 0, c and d are as uncertain as the closure leaves them."""
+def test_unconstrained_motion_has_larger_sigmas(mechanism: Mechanism) -> None:
+    """With two sensors at theta = 0, the closure does not determine c and d."""
     sigmas = []
     for theta in (0.0, 0.3):
         linkage = LinkageFilter(mechanism, 0.2 + theta * np.array([0.0, 1.0, 0.0, 1.0]), 1e-2,
                                 1e-2, ProcessNoise(1e-5))
         for _ in range(20):
-            linkage.correct((0, 1), linkage.angles[:2], NOISE ** 2)
-            linkage.move(PERIOD, np.zeros(4))
+            linkage.update((0, 1), linkage.angles[:2], NOISE ** 2)
+            linkage.predict(PERIOD, np.zeros(4))
         sigmas.append(linkage.sigmas()[:4])
     assert (sigmas[0][:2] < NOISE).all() and (sigmas[1] < NOISE).all()
     assert (sigmas[0][2:] > 0.05).all()
 
 
-def test_covariance_near_and_away_is_the_same(mechanism: Mechanism) -> None:
-    """Where both descriptions hold, by turns of theta just inside and outside the limit."""
+def test_covariance_is_continuous_at_the_limit_of_the_reduced_form(mechanism: Mechanism) -> None:
+    """Theta is just inside and outside the limit, where both descriptions hold."""
     sigmas = []
     for sine in (0.29, 0.31):
         theta = np.arcsin(sine)
         linkage = LinkageFilter(mechanism, 0.2 + theta * np.array([0.0, 1.0, 0.0, 1.0]), 1e-4,
                                 1e-2, ProcessNoise(1e-4, 1e-4))
         for _ in range(250):
-            linkage.correct((0, 1, 2, 3), linkage.angles, NOISE ** 2)
-            linkage.move(PERIOD, np.zeros(4))
+            linkage.update((0, 1, 2, 3), linkage.angles, NOISE ** 2)
+            linkage.predict(PERIOD, np.zeros(4))
         sigmas.append(linkage.sigmas())
     # The mass matrix of this linkage does not depend on theta.
     np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=1e-3)

@@ -2,17 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A linkage whose lengths are not those of its file, and whose joints give, is followed all the same.
+The filter follows a linkage with length errors and compliant joints.
 
-The prototype's linkage near its change points: with lengths that miss by delta the links of a pair
-turn apart by about delta / (l theta), by as much as their joints let them.
+The prototype's linkage near its change points: a length mismatch delta rotates the links of a pair
+apart by about delta / (l theta), limited by the stiffness of the joints.
 """
 
 from dataclasses import replace
 
 from fourbar_ros.estimation import Estimate, Estimator, EstimatorSettings
-from fourbar_ros.estimation.filter import GYROS, LinkageFilter, ProcessNoise
-from fourbar_ros.estimation.filter_state import LENGTHS
+from fourbar_ros.estimation.filter import LinkageFilter
+from fourbar_ros.estimation.filter_model import ProcessNoise
+from fourbar_ros.estimation.filter_state import GYROS, LENGTHS
 from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism, nearest_assembly
 from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.mechanism.dynamics import gamma_matrix
@@ -34,7 +35,7 @@ SETTINGS = EstimatorSettings(
     angle_noise=NOISE, counts_per_turn=0, disturbance_torque=1e-5, disturbance_walk=1e-5,
     closure_tolerance=TOLERANCE)
 LINKS = ('link_a', 'link_b', 'link_c', 'link_d')
-# A thousand numbers exceed 5 sigma with p = 0.0006, if all is well.
+# Bound of errors in sigmas: one of a thousand normal numbers exceeds 5 with p = 0.0006.
 SIGMAS = 5.0
 SEEDS = range(3)
 STIFFNESS = {'joint_stiffness': np.full(4, 1e4), 'joint_damping': np.full(4, 5.0)}
@@ -48,12 +49,12 @@ def rigid() -> Mechanism:
 
 @pytest.fixture(scope='module')
 def compliant(rigid: Mechanism) -> Mechanism:
-    """Let its joints give."""
+    """Make its joints compliant."""
     return replace(rigid, **STIFFNESS)
 
 
 def missing(mechanism: Mechanism, *misses: float) -> Mechanism:
-    """Return a linkage whose links are so much longer [m]."""
+    """Return a linkage with length errors [m]."""
     return replace(mechanism, link_lengths=mechanism.link_lengths + misses)
 
 
@@ -97,7 +98,7 @@ class World:
 def watch(world: World, estimator: Estimator, seconds: float, seed: int, torque: float = 0.0
           ) -> tuple[list[Estimate], Array]:
     """
-    Let an estimator watch, the motors turning links apart by a slow swing [N m].
+    Run an estimator while the motors swing opposite links slowly apart [N m].
 
     :returns: its estimates, and their deviations in sigmas (ticks, 8).
     """
@@ -119,7 +120,7 @@ def watch(world: World, estimator: Estimator, seconds: float, seed: int, torque:
 
 def settled(world: World, known: Mechanism, seconds: float, seed: int, torque: float = 0.0,
             settle: float = 0.2) -> list[Estimate]:
-    """Errors must stay within their sigmas, NIS be that of noise, and nobody be named."""
+    """Check errors against their sigmas, NIS against noise, and that no sensor has a fault."""
     estimator = Estimator(known, SETTINGS)
     estimates, deviations = watch(world, estimator, seconds, seed, torque)
     begin = round(settle / PERIOD)
@@ -143,7 +144,7 @@ def settled(world: World, known: Mechanism, seconds: float, seed: int, torque: f
                          ids=['a', 'b', 'none'])
 def test_slow_passage(seed: int, aligned: float, miss: tuple[float, ...], compliant: Mechanism
                       ) -> None:
-    """Through the change point, up to where the links are apart by a degree and swing."""
+    """Through the change point, until the links are apart by a degree and swing."""
     world = World(missing(compliant, *miss), aligned - 0.4, 0.2)
     settled(world, compliant, 2.7, seed, torque=5e-4)
     assert np.sin(world.angles[1] - world.angles[0] - aligned) > 0.08
@@ -154,16 +155,16 @@ def test_slow_passage(seed: int, aligned: float, miss: tuple[float, ...], compli
 @pytest.mark.parametrize('miss', [(3e-4, 0.0, 0.0, 0.0), (0.0, -3e-4, 0.0, 0.0)], ids=['a', 'b'])
 def test_turning_off_at_a_change_point(seed: int, aligned: float, miss: tuple[float, ...],
                                        compliant: Mechanism) -> None:
-    """Too slow for so large a mismatch, it leaves towards the folded branch, and is followed."""
+    """Too slow for the large mismatch: the linkage leaves towards the folded branch."""
     world = World(missing(compliant, *miss), aligned - 0.3, 0.08)
     settled(world, compliant, 4.5, seed)
     assert abs(np.sin(world.angles[2] - world.angles[0])) > 0.02
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_joints_that_give_though_the_file_calls_them_rigid(seed: int, rigid: Mechanism,
+def test_compliant_joints_with_a_rigid_model(seed: int, rigid: Mechanism,
                                                            compliant: Mechanism) -> None:
-    """The estimate is worse, but the sensors are believed, and not the joints."""
+    """The force of the joints is uncertain: errors are larger, but no sensor is faulty."""
     world = World(missing(compliant, 1e-4, 0.0, 0.0, 0.0), -0.4, 0.2)
     estimator = Estimator(rigid, SETTINGS)
     estimates, _ = watch(world, estimator, 2.7, seed)
@@ -178,7 +179,7 @@ def test_joints_that_give_though_the_file_calls_them_rigid(seed: int, rigid: Mec
 @pytest.mark.parametrize(('theta', 'rate', 'seconds'), [(-0.4, 0.2, 4.0), (-0.06, 0.02, 6.0)])
 def test_rigid_joints(seed: int, theta: float, rate: float, seconds: float, rigid: Mechanism
                       ) -> None:
-    """Exact lengths that nobody trusts: joints count as stiff as the filter can follow."""
+    """Exact lengths with a tolerance: joints count as stiff as the filter can follow."""
     world = World(rigid, theta, rate)
     settled(world, rigid, seconds, seed)
     assert world.angles[1] > world.angles[0]
@@ -189,7 +190,7 @@ def test_rigid_joints(seed: int, theta: float, rate: float, seconds: float, rigi
 @pytest.mark.parametrize('miss', [0.0, 3e-4])
 def test_start_near_a_change_point(seed: int, theta: float, miss: float, compliant: Mechanism
                                    ) -> None:
-    """All four rates unknown, where the links of a pair may have turned apart."""
+    """All four rates are unknown, and the links of a pair may rotate against each other."""
     # At rest its joints hold it open, if it cannot close.
     world = World(missing(compliant, 0.0, -miss if theta > 0.0 else miss, 0.0, 0.0), theta, 0.05)
     settled(world, compliant, 0.6, seed, settle=0.02)
@@ -201,18 +202,18 @@ def test_start_near_a_change_point(seed: int, theta: float, miss: float, complia
 @pytest.mark.parametrize(('miss', 'delta'), [
     ((3e-4, 0.0, 0.0, 0.0), -3e-4), ((0.0, 3e-4, 0.0, 0.0), 3e-4),
     ((2e-4, 0.0, 0.0, -1e-4), -1e-4)])
-def test_mismatch_is_found_on_the_way_to_a_change_point(
+def test_length_mismatch_is_estimated_before_a_change_point(
     seed: int, miss: tuple[float, ...], delta: float, compliant: Mechanism,
 ) -> None:
-    """That of theta = 0; which of the links it is does not matter there."""
+    """The mismatch at theta = 0; it does not matter which link causes it."""
     rng = np.random.default_rng(seed)
     world = World(missing(compliant, *miss), -0.5, 0.2)
-    linkage = LinkageFilter(compliant, world.angles, 0.01, 1.0, SETTINGS.randomness)
+    linkage = LinkageFilter(compliant, world.angles, 0.01, 1.0, SETTINGS.process_noise)
     for _ in range(500):
-        linkage.correct((0, 1, 2, 3), world.angles + NOISE * rng.standard_normal(4), NOISE ** 2)
+        linkage.update((0, 1, 2, 3), world.angles + NOISE * rng.standard_normal(4), NOISE ** 2)
         before = world.wheels
         world.move(np.zeros(4))
-        linkage.move(PERIOD, compliant.flywheel_inertias * (world.wheels - before) / PERIOD)
+        linkage.predict(PERIOD, compliant.flywheel_inertias * (world.wheels - before) / PERIOD)
     adds = np.array([-1.0, 1.0, 1.0, -1.0])
     sigma = np.sqrt(adds[1:] @ linkage.P[LENGTHS, LENGTHS] @ adds[1:])
     error = adds @ (linkage.lengths - compliant.link_lengths) - delta
@@ -221,7 +222,7 @@ def test_mismatch_is_found_on_the_way_to_a_change_point(
 
 
 def test_wrong_lengths_leave_no_error_away_from_change_points(rigid: Mechanism) -> None:
-    """Where without tolerance links c and d are off by many sigmas."""
+    """Without tolerance the errors of links c and d are many sigmas."""
     far = []
     for tolerance in (TOLERANCE, 0.0):
         world = World(missing(rigid, 3e-4, -3e-4, 0.0, 0.0), 0.6, 0.1)
@@ -231,8 +232,8 @@ def test_wrong_lengths_leave_no_error_away_from_change_points(rigid: Mechanism) 
     assert far[0] < SIGMAS < far[1]
 
 
-def test_sensor_that_begins_to_err_is_named_all_the_same(compliant: Mechanism) -> None:
-    """What lengths do not explain: 0.6 deg, where 1e-3 of the length would be 0.1 deg."""
+def test_sensor_bias_is_isolated_with_uncertain_lengths(compliant: Mechanism) -> None:
+    """0.6 deg: length errors of 1e-3 explain 0.1 deg only."""
     rng = np.random.default_rng(4)
     world = World(compliant, 1.0, 0.0)
     estimator = Estimator(compliant, SETTINGS)
@@ -256,18 +257,18 @@ def test_sensor_that_begins_to_err_is_named_all_the_same(compliant: Mechanism) -
 def test_links_swing_as_those_of_the_plant(
     theta: float, aligned: float, changed: dict[str, Array], compliant: Mechanism,
 ) -> None:
-    """Where they are after half a second, from knowing all at its begin."""
+    """Compare positions half a second after an exact initial state."""
     linkage = replace(compliant, **changed)
     world = World(missing(linkage, 1e-4, 0.0, 0.0, 0.0), aligned + theta, 0.05, apart=0.05)
     filtered = LinkageFilter(
-        linkage, world.angles, 1e-8, 1e-8, ProcessNoise(0.0, closure=TOLERANCE))
+        linkage, world.angles, 1e-8, 1e-8, ProcessNoise(0.0, closure_tolerance=TOLERANCE))
     filtered.x[LENGTHS] -= 1e-4
     filtered.x[4:8] = world.rates
     apart, errors = [], []
     for _ in range(125):
         before = world.wheels
         world.move(np.zeros(4))
-        filtered.move(PERIOD, linkage.flywheel_inertias * (world.wheels - before) / PERIOD)
+        filtered.predict(PERIOD, linkage.flywheel_inertias * (world.wheels - before) / PERIOD)
         apart.append(world.angles[2] - world.angles[0])
         errors.append(wrap_angles(filtered.angles - world.angles))
     # Joints swing at 155 rad/s, links against each other at up to 40: what is left out is of order
@@ -282,13 +283,13 @@ def test_transition_is_that_of_the_prediction(compliant: Mechanism) -> None:
         compliant, np.array([0.2, 0.3, 0.2, 0.3]), 1e-6, 1e-4, ProcessNoise(1e-5, 1e-5, 0.0, 3e-4))
     # Apart by 2 mrad.
     linkage.x[:4] += 1e-3 * np.array([-1.0, -1.0, 1.0, 1.0])
-    linkage.correct((0,), linkage.angles[:1], 1.0)
+    linkage.update((0,), linkage.angles[:1], 1.0)
     start = linkage.snapshot()
 
     def end(change: Array) -> Array:
         linkage.restore(start)
         linkage.x += change
-        linkage.move(PERIOD, np.zeros(4))
+        linkage.predict(PERIOD, np.zeros(4))
         return linkage.x.copy()
     end(np.zeros(13))
     transition = linkage.F.copy()
@@ -312,9 +313,9 @@ def test_transition_is_that_of_the_prediction(compliant: Mechanism) -> None:
 def test_links_follow_the_lengths_away_from_change_points(uneven: Mechanism) -> None:
     """By finite differences of the assembly, of the transition and of the covariance."""
     linkage = LinkageFilter(uneven, assemble(uneven, 0.2, 1.5), 1e-12, 1e-12,
-                            ProcessNoise(0.0, closure=1e-4))
+                            ProcessNoise(0.0, closure_tolerance=1e-4))
     # At rest, so that nothing but the lengths changes.
-    linkage.move(PERIOD, np.zeros(4))
+    linkage.predict(PERIOD, np.zeros(4))
     slopes = np.zeros((2, 3))
     for n in range(3):
         for sign in (1.0, -1.0):
@@ -329,10 +330,10 @@ def test_links_follow_the_lengths_away_from_change_points(uneven: Mechanism) -> 
         linkage.P[2:4, 2:4], slopes @ linkage.P[LENGTHS, LENGTHS] @ slopes.T, rtol=1e-4)
 
 
-def test_gap_at_the_start_is_the_tolerance(uneven: Mechanism) -> None:
-    """What the lengths miss, all around the loop, is as large as the setting says."""
+def test_initial_closure_error_is_the_tolerance(uneven: Mechanism) -> None:
+    """The standard deviation of the gap around the loop is the setting."""
     linkage = LinkageFilter(uneven, assemble(uneven, 0.2, 1.5), 1e-6, 1e-6,
-                            ProcessNoise(0.0, closure=1e-3))
+                            ProcessNoise(0.0, closure_tolerance=1e-3))
     signed = np.array([[np.cos(angle), np.sin(angle)] for angle in linkage.angles]).T * [
         -1.0, 1.0, 1.0, -1.0]
     covariance = linkage.P[LENGTHS, LENGTHS]
@@ -341,17 +342,17 @@ def test_gap_at_the_start_is_the_tolerance(uneven: Mechanism) -> None:
     np.testing.assert_allclose(np.sqrt(gap), 1e-3, rtol=1e-9)
 
 
-def test_gyros_come_after_the_lengths(compliant: Mechanism) -> None:
+def test_gyro_biases_follow_the_lengths_in_the_state(compliant: Mechanism) -> None:
     rng = np.random.default_rng(6)
     angles = assemble(compliant, 0.2, 1.3)
-    linkage = LinkageFilter(compliant, angles, 1e-4, 1e-4, SETTINGS.randomness)
+    linkage = LinkageFilter(compliant, angles, 1e-4, 1e-4, SETTINGS.process_noise)
     for _ in range(1000):
         noise = rng.standard_normal(5)
-        linkage.correct(
+        linkage.update(
             (0, 1, 2, 3, GYROS + 1), np.append(angles + NOISE * noise[:4], 0.02 + 1e-3 * noise[4]),
             [NOISE ** 2] * 4 + [1e-6])
-        linkage.move(PERIOD, np.zeros(4))
-    np.testing.assert_allclose(linkage.gyro_biases, [0.02], rtol=0.0,
+        linkage.predict(PERIOD, np.zeros(4))
+    np.testing.assert_allclose(list(linkage.gyro_biases.values()), [0.02], rtol=0.0,
                                atol=SIGMAS * linkage.sigmas()[-1])
     assert len(linkage.x) == 14
 
@@ -359,16 +360,16 @@ def test_gyros_come_after_the_lengths(compliant: Mechanism) -> None:
 # Without tolerance
 
 def test_exact_lengths_are_not_estimated(rigid: Mechanism, compliant: Mechanism) -> None:
-    """And how far joints give does not matter: the same to the last bit."""
+    """The stiffness of the joints has no effect: equal to the last bit."""
     ends = []
     for mechanism in (rigid, compliant):
         rng = np.random.default_rng(7)
         linkage = LinkageFilter(mechanism, np.array([0.2, 0.3, 0.2, 0.3]), 1e-4, 1e-2,
                                 ProcessNoise(1e-5, 1e-5))
         for _ in range(50):
-            linkage.correct((0, 1, 2, 3), linkage.angles + NOISE * rng.standard_normal(4),
+            linkage.update((0, 1, 2, 3), linkage.angles + NOISE * rng.standard_normal(4),
                             NOISE ** 2)
-            linkage.move(PERIOD, 1e-3 * rng.standard_normal(4))
+            linkage.predict(PERIOD, 1e-3 * rng.standard_normal(4))
         np.testing.assert_array_equal(linkage.lengths, rigid.link_lengths)
         ends.append(np.concatenate([linkage.x, linkage.P.ravel()]).tobytes())
     assert ends[0] == ends[1]
