@@ -134,6 +134,7 @@ def test_fits_reproduce_both_numbers_and_all_statements(fitted) -> None:
         assert each.effects.as_stated == (True, True, True)
 
 
+@pytest.mark.slow
 def test_kanes_method_comes_to_the_same_numbers(fitted) -> None:
     """Nominal and defective linkage by SymPy along the chain, integrated by SciPy."""
     pytest.importorskip('sympy')
@@ -174,6 +175,7 @@ def result() -> Result:
         return load_study('cad')(lambda items, count: items)
 
 
+@pytest.mark.slow
 def test_study_passes_its_checks_and_rules_out_defects(result: Result) -> None:
     assert [check.name for check in result.checks if not check.passed] == []
     assert len({check.name for check in result.checks}) == len(result.checks)
@@ -191,6 +193,7 @@ def test_study_passes_its_checks_and_rules_out_defects(result: Result) -> None:
     assert max(document['rms_of_largest_offset_deg']) < np.degrees(0.1)
 
 
+@pytest.mark.slow
 def test_tables_contain_the_results(result: Result) -> None:
     rows = list(csv.DictReader(StringIO(str(result.files['cad.csv']))))
     assert len(rows) == 4 * len(result.data['single'])
@@ -204,6 +207,7 @@ def test_tables_contain_the_results(result: Result) -> None:
     assert 'never both' in result.text
 
 
+@pytest.mark.slow
 def test_figure_is_whole(result: Result) -> None:
     """Something is drawn in the middle, and nothing at the edges, where it would be cut."""
     image = pytest.importorskip('matplotlib.image')

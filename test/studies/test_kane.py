@@ -162,6 +162,7 @@ def test_start_on_a_change_point_is_refused(paper: Mechanism, refuses: Refuses) 
         kane.simulate(case)
 
 
+@pytest.mark.slow
 def test_motion_into_a_line_of_links_ends(uneven: Mechanism) -> None:
     """A kite whose links c and d meet a and b: the steps would shrink without end."""
     kite = replace(uneven, link_lengths=np.array([0.1, 0.1, 0.12, 0.12]))
