@@ -30,10 +30,10 @@ from fourbar_ros.mechanism.closure import BRANCHES
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plant import InitialState, load_table, Table
 
+# Longest duration [s]: the memory of a run grows with it.
 LONGEST_RUN = 3600.0
-"""Longest duration [s]: the memory of a run grows with it."""
+# Deprecated name of the key `model`.
 OLD_MODEL_KEY = 'believed'
-"""Deprecated name of the key `model`."""
 
 _STEP = Setting('step', 5e-4, 's', 'integration step; the period is a whole multiple of it',
                 low=1e-6, high=0.1)

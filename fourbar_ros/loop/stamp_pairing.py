@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
+# Number of ticks that may be incomplete at the same time.
 DEPTH = 16
-"""Number of ticks that may be incomplete at the same time."""
+# Largest drift between the clock of the stamps and the monotonic clock [s/s].
 DRIFT = 1e-4
-"""Largest drift between the clock of the stamps and the monotonic clock [s/s]."""
 
 
 class StampPairs:

@@ -33,23 +33,21 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
+# Longest wait for the discovery of a running node, or for its answer [s].
 TIMEOUT = 5.0
-"""Longest wait for the discovery of a running node, or for its answer [s]."""
+# Retry interval of a service call [s].
 RETRY_INTERVAL = 1.0
-"""Retry interval of a service call [s]."""
+# Delay of a call that must not be retried, in which the server discovers the client [s].
 DISCOVERY_DELAY = 0.2
-"""Delay of a call that must not be retried, in which the server discovers the client [s]."""
+# Longest time between two checks of a condition [s].
 POLL_INTERVAL = 0.05
-"""Longest time between two checks of a condition [s]."""
+# Services that may be retried: a second call has no further effect.
+#
+# Not among them: sim/step; and arming, enabling and releasing a stop, because another operator may
+# have disarmed or stopped the device between the two calls.
 IDEMPOTENT = frozenset({DAMP, EMERGENCY_STOP, ESTIMATE_RESET, HOLD, SIM_PAUSE, SIM_RESET})
-"""
-Services that may be retried: a second call has no further effect.
-
-Not among them: sim/step; and arming, enabling and releasing a stop, because another operator may
-have disarmed or stopped the device between the two calls.
-"""
+# Services that may be retried with the argument false.
 IDEMPOTENT_IF_FALSE = frozenset({ARM, ENABLE})
-"""Services that may be retried with the argument false."""
 
 
 class ServiceCall:

@@ -30,13 +30,13 @@ from rosbags.typesys import get_typestore, Stores
 from sensor_msgs.msg import JointState
 
 DEEP = QoSProfile(depth=QUEUE_DEPTH)
+# Time without a tick after which the device counts as gone [s].
 SILENCE_TIMEOUT = 2.0
-"""Time without a tick after which the device counts as gone [s]."""
+# Time in which another publisher of commands is discovered [s].
 DISCOVERY_TIME = 1.0
-"""Time in which another publisher of commands is discovered [s]."""
 
+# Called with the elapsed time [s].
 Progress = Callable[[float], None]
-"""Called with the elapsed time [s]."""
 
 
 class Excitation(Protocol):

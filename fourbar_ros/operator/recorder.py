@@ -33,12 +33,12 @@ from rosbags.typesys import get_typestore, Stores, TypesysError
 from tqdm import tqdm
 
 INTERNAL_TOPICS = ('/rosout', '/parameter_events')
+# Messages per topic that wait for a slow disk; a closed loop publishes 3000 a second in all.
 QUEUE_DEPTH = 10_000
-"""Messages per topic that wait for a slow disk; a closed loop publishes 3000 a second in all."""
+# Period of the search for new topics [s].
 GRAPH_POLL_S = 0.1
-"""Period of the search for new topics [s]."""
+# Time after a signal for the messages in the queue of the executor [s].
 DRAIN_S = 0.3
-"""Time after a signal for the messages in the queue of the executor [s]."""
 
 
 class RecorderError(FourbarError):

@@ -23,32 +23,19 @@ from fourbar_ros.control.scalars import (
 from fourbar_ros.control.wheel_command import by_name
 from fourbar_ros.loop.stamp_pairing import LatenessDetector, StampPairs
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism
+from fourbar_ros.ros import messages
 from fourbar_ros.ros.base_node import BaseNode, run_node
-from fourbar_ros.ros.messages import (
-    DiagnosticsPublisher,
-    JointStatePublisher,
-    LATCHED,
-    OK,
-    RecentIncrease,
-    RELIABLE,
-    Report,
-    sensor_qos,
-    stamp_of,
-    status_message,
-    TABLE_FRAME,
-    ThrottledLog,
-    WARN,
-)
+from fourbar_ros.ros.messages import JointStatePublisher, stamp_of
 from fourbar_ros.ros.runtime import Runtime
 import numpy as np
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+# Ticks between two messages on allocation and momentum, which take time and change slowly.
 TICKS_PER_SCALARS = 5
-"""Ticks between two messages on allocation and momentum, which take time and change slowly."""
+# Ticks between two checks of the momentum margin, which take time.
 TICKS_PER_MOMENTUM_CHECK = 25
-"""Ticks between two checks of the momentum margin, which take time."""
 NO_DISTURBANCE = np.zeros(2)
 
 
@@ -63,14 +50,14 @@ class ControllerNode(BaseNode):
         self._pairs = StampPairs()
         # In simulated time the device waits for late nodes.
         self._lateness = None if self.simulated_time else LatenessDetector()
-        self._log = ThrottledLog(self)
+        self._log = messages.ThrottledLog(self)
         self._last_stamp_ns: int | None = None
         self._ticks = 0
 
         self._command = JointStatePublisher(
             self, names.FLYWHEEL_COMMAND, FLYWHEEL_NAMES, ('effort',))
         self._reference = JointStatePublisher(
-            self, names.REFERENCE, LINK_NAMES, frame=TABLE_FRAME)
+            self, names.REFERENCE, LINK_NAMES, frame=messages.TABLE_FRAME)
         self._error = JointStatePublisher(self, names.TRACKING_ERROR, LINK_NAMES)
         self._energy = JointStatePublisher(self, names.ENERGY, ENERGIES, ('position',))
         self._allocation = JointStatePublisher(
@@ -82,15 +69,15 @@ class ControllerNode(BaseNode):
         self.create_service(Trigger, names.HOLD, guard(self._on_hold))
         self.create_service(Trigger, names.DAMP, guard(self._on_damp))
         self.create_subscription(
-            JointState, names.FLYWHEEL_STATES, guard(self._on_wheels), sensor_qos(self))
+            JointState, names.FLYWHEEL_STATES, guard(self._on_wheels), messages.sensor_qos(self))
         self.create_subscription(
-            JointState, names.ESTIMATE_LINK_STATES, guard(self._on_estimate), RELIABLE)
+            JointState, names.ESTIMATE_LINK_STATES, guard(self._on_estimate), messages.RELIABLE)
         self.create_subscription(
-            DiagnosticStatus, names.DEVICE_STATUS, guard(self._on_device_status), LATCHED)
+            DiagnosticStatus, names.DEVICE_STATUS, guard(self._on_device_status), messages.LATCHED)
         self.create_subscription(
-            JointState, names.SETPOINT, guard(self._on_setpoint), RELIABLE)
+            JointState, names.SETPOINT, guard(self._on_setpoint), messages.RELIABLE)
         self.create_subscription(
-            JointTrajectory, names.TRAJECTORY, guard(self._on_trajectory), RELIABLE)
+            JointTrajectory, names.TRAJECTORY, guard(self._on_trajectory), messages.RELIABLE)
         self._status.publish_changes()
 
     def close(self) -> None:
@@ -193,19 +180,19 @@ class StatusPublisher:
     :ivar judged_stamp: stamp of the last setpoint or trajectory that was accepted or refused.
     """
 
-    def __init__(self, node: BaseNode, controller: Controller, log: ThrottledLog) -> None:
+    def __init__(self, node: BaseNode, controller: Controller, log: messages.ThrottledLog) -> None:
         self.judged_stamp = ''
         self._node = node
         self._controller = controller
         self._log = log
-        self._refused = RecentIncrease()
+        self._refused = messages.RecentIncrease()
         self._published: tuple[object, ...] | None = None
         self._logged_problem = ''
         self._ticks = 0
         self._momentum_warning = ''
         self._publisher = node.create_publisher(
-            DiagnosticStatus, names.CONTROLLER_STATUS, LATCHED)
-        self._diagnostics = DiagnosticsPublisher(node, '', self._report)
+            DiagnosticStatus, names.CONTROLLER_STATUS, messages.LATCHED)
+        self._diagnostics = messages.DiagnosticsPublisher(node, '', self._report)
 
     def tick(self) -> None:
         """Publish the status after a control step, if it changed."""
@@ -229,7 +216,7 @@ class StatusPublisher:
         goal = '' if controller.goal is None else ' '.join(
             f'{name}={angle:.6f}' for name, angle in zip(LINK_NAMES, controller.goal))
         level, summary = self._summary()
-        self._publisher.publish(status_message(
+        self._publisher.publish(messages.status_message(
             self._node, '', level, summary, {
                 'mode': controller.mode, 'goal': goal, 'branch': controller.branch,
                 'setpoint_duration_s': controller.settings.setpoint_duration,
@@ -246,9 +233,9 @@ class StatusPublisher:
         controller = self._controller
         warnings = [text for text in (
             controller.problem, self._wheel_faults(), self._momentum_warning) if text]
-        return WARN if warnings else OK, ', '.join((controller.mode, *warnings))
+        return messages.WARN if warnings else messages.OK, ', '.join((controller.mode, *warnings))
 
-    def _report(self) -> Report:
+    def _report(self) -> messages.Report:
         controller = self._controller
         values: dict[str, object] = {
             'mode': controller.mode, 'setpoints_accepted': controller.accepted,
@@ -256,10 +243,10 @@ class StatusPublisher:
             'ticks_saturated': controller.saturated, 'problem': controller.problem,
             'wheel_faults': self._wheel_faults(), 'momentum': self._momentum_warning}
         if not self._ticks:
-            return WARN, 'waiting for flywheel_states and estimate/link_states', values
+            return messages.WARN, 'waiting for flywheel_states and estimate/link_states', values
         level, summary = self._summary()
-        if level == OK and self._refused.update(controller.refused):
-            return WARN, f'{controller.mode}, setpoints were refused', values
+        if level == messages.OK and self._refused.update(controller.refused):
+            return messages.WARN, f'{controller.mode}, setpoints were refused', values
         return level, summary, values
 
 

@@ -27,34 +27,20 @@ from fourbar_ros.device import (
 )
 from fourbar_ros.device.arming import DeviceState
 from fourbar_ros.mechanism import FLYWHEEL_NAMES
+from fourbar_ros.ros import messages
 from fourbar_ros.ros.base_node import BaseNode, settings_from
-from fourbar_ros.ros.messages import (
-    create_steady_timer,
-    DiagnosticsPublisher,
-    ERROR,
-    JointStatePublisher,
-    LATCHED,
-    OK,
-    RecentIncrease,
-    RELIABLE,
-    Report,
-    stamp_of,
-    status_message,
-    TABLE_FRAME,
-    ThrottledLog,
-    WARN,
-)
+from fourbar_ros.ros.messages import JointStatePublisher, stamp_of
 from fourbar_ros.ros.runtime import Runtime
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
+# Longest delay after which every missed tick is still made [ns].
 CATCH_UP_NS = 100_000_000
-"""Longest delay after which every missed tick is still made [ns]."""
+# Topics with at most one publisher while armed: a second controller or device is an error.
 SINGLE_PUBLISHER = (names.FLYWHEEL_COMMAND, names.LINK_ANGLES)
-"""Topics with at most one publisher while armed: a second controller or device is an error."""
-LEVELS = {DeviceState.DISARMED: OK, DeviceState.ARMED: OK,
-          DeviceState.EMERGENCY_STOP: ERROR, DeviceState.FAULT: ERROR}
+LEVELS = {DeviceState.DISARMED: messages.OK, DeviceState.ARMED: messages.OK,
+          DeviceState.EMERGENCY_STOP: messages.ERROR, DeviceState.FAULT: messages.ERROR}
 TIMING_NAMES = ('round_trip_s', 'command_age_s', 'lost', 'step_s')
 
 
@@ -84,24 +70,25 @@ class DeviceNode(BaseNode):
         self.period_ns = settings.period_ns
         self._supervisor = DeviceSupervisor(self.make_device(), settings)
         device = self._supervisor.device
-        self._log, self._error_log = ThrottledLog(self), ThrottledLog(self)
-        self._rejected = RecentIncrease()
+        self._log, self._error_log = messages.ThrottledLog(self), messages.ThrottledLog(self)
+        self._rejected = messages.RecentIncrease()
         self._publishers_of_device = DevicePublishers(self, self._supervisor, values['mechanism'])
         self.create_subscription(
-            JointState, names.FLYWHEEL_COMMAND, guard(self._on_command), RELIABLE)
+            JointState, names.FLYWHEEL_COMMAND, guard(self._on_command), messages.RELIABLE)
         self.create_subscription(
-            Bool, names.EMERGENCY_STOP_REQUEST, guard(self._on_emergency_stop_request), RELIABLE)
+            Bool, names.EMERGENCY_STOP_REQUEST, guard(self._on_emergency_stop_request),
+            messages.RELIABLE)
         self.create_service(SetBool, names.ARM, guard(self._on_arm))
         self.create_service(Trigger, names.EMERGENCY_STOP, guard(self._on_emergency_stop))
         self.create_service(
             Trigger, names.RESET_EMERGENCY_STOP, guard(self._on_reset_emergency_stop))
-        self._diagnostics = DiagnosticsPublisher(self, device.description, self._report)
+        self._diagnostics = messages.DiagnosticsPublisher(self, device.description, self._report)
         self._catching_up = False
         # The clock starts just before its timer, so that the timer fires right after a tick is
         # due.
         self.clock_mode, poll_ns = self.make_clock_mode()
         # rclpy rounds the period down to whole nanoseconds.
-        create_steady_timer(self, (poll_ns + 0.5) * 1e-9, self._on_timer)
+        messages.create_steady_timer(self, (poll_ns + 0.5) * 1e-9, self._on_timer)
         self.publish_status()
         self.logger.info(
             f'{device.description} with mechanism {values["mechanism"]} at {values["rate"]:g} Hz')
@@ -254,13 +241,13 @@ class DeviceNode(BaseNode):
             self._supervisor.emergency_stop('emergency_stop_request')
             self.publish_status()
 
-    def _report(self) -> Report:
+    def _report(self) -> messages.Report:
         arming = self._supervisor.arming
         level, summary = LEVELS[arming.state], arming.state.value
-        if self._rejected.update(self._supervisor.rejected.total()) and level == OK:
-            level, summary = WARN, f'{summary}, commands were rejected'
+        if self._rejected.update(self._supervisor.rejected.total()) and level == messages.OK:
+            level, summary = messages.WARN, f'{summary}, commands were rejected'
         for text in filter(None, (self.stall_reason(), *self._supervisor.device.diagnostics())):
-            level, summary = max(level, WARN), f'{summary}, {text}'
+            level, summary = max(level, messages.WARN), f'{summary}, {text}'
         return level, summary, {
             **self._supervisor.diagnostics(), 'ticks_skipped': self.clock_mode.skipped,
             'ticks': self.clock_mode.ticks}
@@ -284,11 +271,13 @@ class DevicePublishers:
         self._published_state: tuple[DeviceState, str, int] | None = None
         self._links = JointStatePublisher(
             node, names.LINK_ANGLES, device.sensor_names,
-            ('position', 'velocity') if device.measures_rates else ('position',), TABLE_FRAME)
+            ('position', 'velocity') if device.measures_rates else ('position',),
+            messages.TABLE_FRAME)
         self._wheels = JointStatePublisher(
             node, names.FLYWHEEL_STATES, FLYWHEEL_NAMES, ('position', 'velocity', 'effort'))
         self._timing = JointStatePublisher(node, names.TIMING, TIMING_NAMES, ('position',))
-        self._status = node.create_publisher(DiagnosticStatus, names.DEVICE_STATUS, LATCHED)
+        self._status = node.create_publisher(
+            DiagnosticStatus, names.DEVICE_STATUS, messages.LATCHED)
 
     def publish_samples(self, links: bool) -> None:
         """
@@ -317,7 +306,7 @@ class DevicePublishers:
             return False
         self._published_state = state
         text = f'{arming.state.value}: {arming.reason}'
-        self._status.publish(status_message(
+        self._status.publish(messages.status_message(
             self._node, self._device.description, LEVELS[arming.state], text, {
                 'state': arming.state.value, 'reason': arming.reason,
                 'since': f'{arming.since_ns * 1e-9:.9f}', 'mechanism': self._mechanism}))

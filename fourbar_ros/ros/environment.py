@@ -18,10 +18,10 @@ import os
 
 from fourbar_ros.common.errors import FourbarError
 
+# First version of rclpy with the EventsExecutor.
 OLDEST_RCLPY = (7, 1, 4)
-"""First version of rclpy with the EventsExecutor."""
+# Largest domain id whose ports are below 65536.
 LARGEST_DOMAIN = 232
-"""Largest domain id whose ports are below 65536."""
 
 
 class RosError(FourbarError):

@@ -25,27 +25,16 @@ from fourbar_ros.estimation.estimator_topics import (
 )
 from fourbar_ros.estimation.wheel_motion import BY_SPEED
 from fourbar_ros.mechanism import load_mechanism
+from fourbar_ros.ros import messages
 from fourbar_ros.ros.base_node import BaseNode, run_node
-from fourbar_ros.ros.messages import (
-    DiagnosticsPublisher,
-    JointStatePublisher,
-    OK,
-    RecentIncrease,
-    RELIABLE,
-    Report,
-    sensor_qos,
-    stamp_of,
-    ThrottledLog,
-    WARN,
-    write_stamp,
-)
+from fourbar_ros.ros.messages import JointStatePublisher, stamp_of
 from fourbar_ros.ros.runtime import Runtime
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
+# Ticks between two comparisons of the diagnostics, which take time.
 TICKS_PER_DIAGNOSTICS = 5
-"""Ticks between two comparisons of the diagnostics, which take time."""
 
 
 class EstimatorNode(BaseNode):
@@ -57,15 +46,15 @@ class EstimatorNode(BaseNode):
         self._topics = EstimatorTopics(
             load_mechanism(values.pop('mechanism')), EstimatorSettings(**values))
         self._estimator = self._topics.estimator
-        self._log, self._rejected = ThrottledLog(self), RecentIncrease()
+        self._log, self._rejected = messages.ThrottledLog(self), messages.RecentIncrease()
         self._subscribed_to_commands, self._starts, self._ticks = False, 0, 0
         self._outputs: dict[str, JointStatePublisher] = {}
         for topic, output in OUTPUTS.items():
             if not output.optional:
                 self._create_output(topic)
-        self._waiting = self.create_publisher(Header, ESTIMATE_WAITING, RELIABLE)
+        self._waiting = self.create_publisher(Header, ESTIMATE_WAITING, messages.RELIABLE)
         self.create_service(Trigger, ESTIMATE_RESET, runtime.guard(self._on_reset))
-        self._diagnostics = DiagnosticsPublisher(self, '', self._report)
+        self._diagnostics = messages.DiagnosticsPublisher(self, '', self._report)
         for topic in INPUTS:
             self._subscribe(topic)
 
@@ -76,7 +65,7 @@ class EstimatorNode(BaseNode):
 
     def _subscribe(self, topic: str) -> None:
         self.create_subscription(JointState, topic, self.runtime.guard(
-            partial(self._on_input, topic)), sensor_qos(self))
+            partial(self._on_input, topic)), messages.sensor_qos(self))
 
     def _on_input(self, topic: str, message: JointState) -> None:
         answer = self._topics.receive(topic, stamp_of(message), message.name, message.position,
@@ -105,7 +94,7 @@ class EstimatorNode(BaseNode):
     def _publish(self, output: OutputMessage) -> None:
         if output.topic == ESTIMATE_WAITING:
             header = Header()
-            write_stamp(header.stamp, output.stamp_ns)
+            messages.write_stamp(header.stamp, output.stamp_ns)
             self._waiting.publish(header)
             return
         if output.topic not in self._outputs:
@@ -119,7 +108,7 @@ class EstimatorNode(BaseNode):
         response.success, response.message = True, 'starts again from the next link_angles'
         return response
 
-    def _report(self) -> Report:
+    def _report(self) -> messages.Report:
         estimator = self._estimator
         values: dict[str, object] = {
             'starts': estimator.starts, 'last_rejection': estimator.last_rejection}
@@ -130,14 +119,15 @@ class EstimatorNode(BaseNode):
         values['sensor_faults'] = faults
         values['driven_by'] = estimator.driven_by
         if estimator.waiting_for:
-            return WARN, f'waiting for {estimator.waiting_for}', values
+            return messages.WARN, f'waiting for {estimator.waiting_for}', values
         if faults:
-            return WARN, f'running, {faults}', values
+            return messages.WARN, f'running, {faults}', values
         if estimator.driven_by != BY_SPEED:
-            return WARN, f'running without wheel speeds, driven by {estimator.driven_by}', values
+            text = f'running without wheel speeds, driven by {estimator.driven_by}'
+            return messages.WARN, text, values
         if self._rejected.update(estimator.rejected.total()):
-            return WARN, 'running, measurements were rejected', values
-        return OK, 'running', values
+            return messages.WARN, 'running, measurements were rejected', values
+        return messages.OK, 'running', values
 
 
 def main(argv: Sequence[str]) -> int:

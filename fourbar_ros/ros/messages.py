@@ -18,21 +18,21 @@ from rclpy.clock_type import ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
+# Of all publishers but the latched ones: default subscribers ignore best-effort publishers.
 RELIABLE = QoSProfile(depth=10)
-"""Of all publishers but the latched ones: default subscribers ignore best-effort publishers."""
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 SENSOR_IN_SIMULATED_TIME = QoSProfile(depth=5)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 TABLE_FRAME = 'table'
+# Shortest time between two log lines about wrong inputs [s].
 LOG_PERIOD = 1.0
-"""Shortest time between two log lines about wrong inputs [s]."""
+# Time for which a rejected message keeps the diagnostics of a node at warning [s].
 RECENT = 10.0
-"""Time for which a rejected message keeps the diagnostics of a node at warning [s]."""
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
+# Level, summary and values of a diagnostic status.
 Report = tuple[Any, str, dict[str, object]]
-"""Level, summary and values of a diagnostic status."""
 
 
 def sensor_qos(node: BaseNode) -> QoSProfile:

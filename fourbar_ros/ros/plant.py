@@ -40,19 +40,19 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
+# Limits of the period of polling a simulated clock [ns]; a poll makes all ticks that are due.
 SHORTEST_POLL_NS = 500_000
 LONGEST_POLL_NS = 50_000_000
-"""Limits of the period of polling a simulated clock [ns]; a poll makes all ticks that are due."""
+# Shortest period of /clock [ns of the monotonic clock].
 CLOCK_NS = 5_000_000
-"""Shortest period of /clock [ns of the monotonic clock]."""
+# Longest period of /clock [ns]: nodes that start while time is paused need the time too.
 IDLE_CLOCK_NS = 50_000_000
-"""Longest period of /clock [ns]: nodes that start while time is paused need the time too."""
+# Period of counting the participants of a lock-step [ns].
 GRAPH_POLL_NS = 50_000_000
-"""Period of counting the participants of a lock-step [ns]."""
+# Time that nodes need to discover each other [ns].
 SETTLE_NS = 500_000_000
-"""Time that nodes need to discover each other [ns]."""
+# Stamp in a serialized message with a header: it follows four bytes of encapsulation.
 SERIALIZED_STAMP = struct.Struct('<4xiI')
-"""Stamp in a serialized message with a header: it follows four bytes of encapsulation."""
 
 _TABLE, *_OTHERS = table_parameters('ideal')
 PARAMETERS = (

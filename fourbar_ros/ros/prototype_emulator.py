@@ -28,8 +28,8 @@ from fourbar_ros.ros.simulation import apply_faults, GroundTruth, make_table, ta
 import numpy as np
 
 LETTERS = 'abcd'
+# Period of running the callbacks of ROS, between the frames of the bus [ns].
 CALLBACK_PERIOD_NS = 5_000_000
-"""Period of running the callbacks of ROS, between the frames of the bus [ns]."""
 
 PARAMETERS = (
     Setting('mechanism', 'prototype', '', 'preset or path of a mechanism file'),
@@ -43,9 +43,9 @@ PARAMETERS = (
       for target, troubles in (*((name, INJECTABLE_LINK_FAULTS) for name in LINK_NAMES),
                                ('bus', INJECTABLE_BUS_FAULTS))),
 )
+# Target of each parameter that causes trouble on the bus.
 TROUBLES = {row.name: row.name.partition('.')[2] for row in PARAMETERS
             if row.name.startswith('trouble.')}
-"""Target of each parameter that causes trouble on the bus."""
 
 
 class EmulatorNode(BaseNode):

@@ -20,10 +20,10 @@ from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import try_shutdown
 
+# Longest wait of the executor for a callback [s]; the one of Jazzy hangs in endless waits.
 SPIN_TIMEOUT = 0.2
-"""Longest wait of the executor for a callback [s]; the one of Jazzy hangs in endless waits."""
+# Longest wait at the end for subscribers to acknowledge the last messages [s].
 FLUSH_TIMEOUT = 0.5
-"""Longest wait at the end for subscribers to acknowledge the last messages [s]."""
 
 
 class Runtime:

@@ -24,13 +24,13 @@ from fourbar_ros.ros.messages import JointStatePublisher, RELIABLE, TABLE_FRAME,
 from nav_msgs.msg import Odometry
 import numpy as np
 
+# Scalars of sim/ledger: energies, angular momenta, then the number of contacts with the edge.
 LEDGER_NAMES = tuple(
     item.name if item.name == 'contacts' else
     f'{item.name}_n_m_s' if item.name.endswith('_spin') else f'{item.name}_j'
     for item in fields(EnergyBudget))
-"""Scalars of sim/ledger: energies, angular momenta, then the number of contacts with the edge."""
+# Rate of sim/ledger [Hz in stamps]: its scalars are sums, which change slowly.
 LEDGER_RATE = 10.0
-"""Rate of sim/ledger [Hz in stamps]: its scalars are sums, which change slowly."""
 
 
 def table_parameters(table: str) -> tuple[Setting, ...]:
