@@ -24,7 +24,7 @@ _spec = spec_from_file_location('node_harness', _path)
 harness = module_from_spec(_spec)
 _spec.loader.exec_module(harness)
 compiled, domain, shared_memory = harness.compiled, harness.domain, harness.shared_memory
-module_suite, suite, nursery = harness.module_suite, harness.suite, harness.nursery
+module_suite, suite, fork_server = harness.module_suite, harness.suite, harness.fork_server
 
 # Long enough for a motion of twelve seconds that a busy machine stretches.
 DEMO_S = 180.0

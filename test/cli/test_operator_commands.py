@@ -20,7 +20,7 @@ harness = module_from_spec(_spec)
 _spec.loader.exec_module(harness)
 compiled, domain, shared_memory = harness.compiled, harness.domain, harness.shared_memory
 module_suite, make_probe, probe = harness.module_suite, harness.make_probe, harness.probe
-suite, nursery = harness.suite, harness.nursery
+suite, fork_server = harness.suite, harness.fork_server
 
 COMMANDS = {'arm': [], 'disarm': [], 'stop': [], 'reset': [], 'status': [],
             'setpoint': ['link_a=0']}

@@ -28,10 +28,10 @@ def run(loop: ClosedLoop, seed: int, seconds: float, loss: float, longest: int, 
 
     Of the ticks meanwhile the last few wait for them, as they do in a subscription; the commands
     for these come all at once, when their time has passed. A device that is held up leaves ticks
-    out, and its wheels go on as they were told.
+    out, and its wheels keep their last command.
 
     :param loss: share of ticks at which they are held up.
-    :param longest: for so many ticks at most.
+    :param longest: largest number of ticks.
     :param device: who.
     """
     rng = np.random.default_rng(seed)

@@ -85,7 +85,7 @@ def test_script_acts_from_the_next_tick_on() -> None:
         setpoints=(ScriptedSetpoint(0.199, ('link_a',), (0.1,), 0.2),))
     found = record_run(scenario).arrays()
     commanded = np.flatnonzero(found['flywheel_command.effort'].any(axis=1))
-    # Tick 25 is at 0.1 s; the device is armed after it, and torque is asked for at the next one.
+    # Tick 25 is at 0.1 s; the device is armed after it, and the next tick is the first with torque.
     assert commanded[0] == 26
     moving = np.flatnonzero(found['reference.velocity'].any(axis=1))
     # Tick 50 is the first after 0.199 s, and the move is over after 50 more.
@@ -208,7 +208,7 @@ def test_table_reads_back_bit_for_bit() -> None:
         table[:, column], recording.arrays()['flywheel_command.effort'][:, 2])
 
 
-def test_steps_pass_through_whoever_watches() -> None:
+def test_steps_pass_through_the_progress_display() -> None:
     seen: list[int] = []
 
     def watch(steps, total):  # type: ignore[no-untyped-def]

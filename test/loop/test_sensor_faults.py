@@ -98,8 +98,8 @@ def test_wheels_alone_carry_it_for_a_second_and_then_it_says_that_it_is_lost(
     assert not loop.supervisor.arming.armed
 
 
-def test_nobody_is_named_without_reason(scenario: Scenario) -> None:
-    """Fault-free, nobody is named; the campaign of a hundred runs is `study consistency`."""
+def test_no_sensor_is_reported_without_a_fault(scenario: Scenario) -> None:
+    """Without a fault no sensor is reported; the campaign of a hundred runs is `study consistency`."""
     for seed in range(2):
         loop = make_loop(replace(scenario, seed=100 + seed))
         for _ in quarter_turn(loop):

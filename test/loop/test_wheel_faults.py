@@ -20,7 +20,7 @@ COMMANDS = ('velocity', 'effort')
 
 # What the fault may cost.
 LARGEST_FINAL_ERROR, LARGEST_TRANSIENT = 0.2, 3.0   # deg
-# A wheel that did not follow so much of what it was told [rad/s] is named so much later [s].
+# Speed error at which a wheel is reported [rad/s], and longest detection delay [s].
 UNFOLLOWED, NAMED_WITHIN = 4.0, 1.0
 # Degraded wheels are named so much after they had to give so much [s], [N m].
 DEGRADED_WITHIN, EFFORT = 3.0, 2e-3

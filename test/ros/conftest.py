@@ -31,9 +31,9 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 # Tests are no package: what they share is loaded from its file.
-_spec = spec_from_file_location('nursery', Path(__file__).with_name('nursery.py'))
-_nursery = module_from_spec(_spec)
-_spec.loader.exec_module(_nursery)
+_spec = spec_from_file_location('fork_server', Path(__file__).with_name('fork_server.py'))
+_fork_server = module_from_spec(_spec)
+_spec.loader.exec_module(_fork_server)
 
 DEADLINE_S = 20.0
 """Longest wait for a condition [s of LoadClock]."""
@@ -43,7 +43,7 @@ RETRY_INTERVAL_S = 3.0
 """Time after which the first response of a service counts as lost [s of LoadClock]."""
 DOMAINS = range(1, 102)
 spoiled_domains = set()
-"""Domains in which a process was killed: locks in shared memory may stay closed for ever."""
+"""Domains in which a process was killed: locks in its shared memory may never be released."""
 
 
 class LoadClock:
@@ -164,19 +164,19 @@ class Process:
 
     :param folder: for what it prints.
     :param shared_memory: takes note of what it owns.
-    :param nursery: where to fork it, None for a fresh interpreter.
-    :ivar awaited: whether somebody waited for its end.
+    :param fork_server: where to fork it, None for a fresh interpreter.
+    :ivar awaited: whether a test has waited for its end.
     """
 
-    def __init__(self, name, arguments, folder, shared_memory, nursery):
+    def __init__(self, name, arguments, folder, shared_memory, fork_server):
         self.name = name
         self.awaited = False
         self._shared_memory = shared_memory
         self._out, self._err = (folder / f'{stream}.txt' for stream in ('stdout', 'stderr'))
-        if nursery is not None:
+        if fork_server is not None:
             self._out.touch()
             self._err.touch()
-            self.popen = nursery.start(
+            self.popen = fork_server.start(
                 [name, *arguments], folder, self._out, self._err, dict(os.environ))
             return
         with self._out.open('wb') as out, self._err.open('wb') as err:
@@ -218,7 +218,7 @@ class Process:
         self.popen.wait()
 
     def check_clean(self):
-        """Fail unless it ended as asked and without an outcry."""
+        """Fail unless it ended with exit code 0 and printed no error."""
         assert (self.name, self.popen.returncode) == (self.name, 0), self.stderr
         for word in ('Traceback', 'FATAL', 'Error', 'terminate called'):
             assert word not in self.stdout + self.stderr
@@ -241,7 +241,7 @@ class SharedMemory:
     What the middleware keeps in /dev/shm for the processes of a module.
 
     :ivar seen: files that they were seen to own.
-    :ivar spoiled: whether one was killed, after which what it shared with others stays for ever.
+    :ivar spoiled: whether a process was killed, whose shared files then stay.
     """
 
     def __init__(self):
@@ -266,7 +266,7 @@ class SharedMemory:
         if self.spoiled:
             for path in self.left():
                 path.unlink(missing_ok=True)
-        # Ports from 7000 on are common to all domains: somebody else may hold them.
+        # Ports from 7000 on are common to all domains: another process may hold them.
         assert [path for path in self.left() if 'port70' not in path.name] == []
 
 
@@ -276,13 +276,13 @@ class Suite:
 
     :param folder: for what they print.
     :param shared_memory: takes note of what they own.
-    :param nursery: where to fork those that need no interpreter of their own.
+    :param fork_server: where to fork those that need no interpreter of their own.
     """
 
-    def __init__(self, folder, shared_memory, nursery):
+    def __init__(self, folder, shared_memory, fork_server):
         self.folder = folder
         self._shared_memory = shared_memory
-        self._nursery = nursery
+        self._fork_server = fork_server
         self._started = []
 
     def start(self, name, *arguments, fresh=False):
@@ -295,7 +295,7 @@ class Suite:
         folder = self.folder / f'{len(self._started)}_{name}'
         folder.mkdir()
         process = Process(
-            name, arguments, folder, self._shared_memory, None if fresh else self._nursery)
+            name, arguments, folder, self._shared_memory, None if fresh else self._fork_server)
         self._started.append(process)
         return process
 
@@ -427,7 +427,7 @@ class Probe:
         return self.wait(lambda: messages)[-1]
 
     def more(self, topic, count=1):
-        """Follow a topic, wait for more messages from now on, and return exactly so many."""
+        """Follow a topic, wait for this number of further messages, and return them."""
         messages = self.follow(topic)
         self.catch_up()
         begin = len(messages)
@@ -495,7 +495,7 @@ class Probe:
         return self.call(Trigger, service, Trigger.Request())
 
     def publisher(self, kind, topic, qos=COMMAND):
-        """Make a publisher and wait until somebody listens."""
+        """Make a publisher and wait for its first subscriber."""
         publisher = self.node.create_publisher(kind, topic, qos)
         self.wait(publisher.get_subscription_count)
         return publisher
@@ -542,11 +542,11 @@ def compiled():
 
 
 @pytest.fixture(scope='session')
-def nursery(compiled):
+def fork_server(compiled):
     """Fork processes that need no interpreter of their own."""
-    nursery = _nursery.Nursery()
-    yield nursery
-    nursery.close()
+    fork_server = _fork_server.ForkServer()
+    yield fork_server
+    fork_server.close()
 
 
 @pytest.fixture(scope='module')
@@ -571,17 +571,17 @@ def shared_memory(domain):
 
 
 @pytest.fixture(scope='module')
-def module_suite(shared_memory, nursery, tmp_path_factory):
+def module_suite(shared_memory, fork_server, tmp_path_factory):
     """Run processes until the end of the module."""
-    suite = Suite(tmp_path_factory.mktemp('module'), shared_memory, nursery)
+    suite = Suite(tmp_path_factory.mktemp('module'), shared_memory, fork_server)
     yield suite
     suite.close()
 
 
 @pytest.fixture
-def suite(shared_memory, nursery, tmp_path):
+def suite(shared_memory, fork_server, tmp_path):
     """Run processes until the end of the test."""
-    suite = Suite(tmp_path, shared_memory, nursery)
+    suite = Suite(tmp_path, shared_memory, fork_server)
     yield suite
     suite.close()
 

@@ -25,7 +25,7 @@ PERIOD = 1.0 / RATE
 WRONG = {
     'no points': (['link_a'], [], 'point'),
     'unknown': (['link_x'], [([0.1], 5.0, {})], 'link_x'),
-    'nameless': ([], [([], 5.0, {})], 'named'),
+    'nameless': ([], [([], 5.0, {})], 'name'),
     'twice': (['link_a', 'link_a'], [([0.1, 0.1], 5.0, {})], 'twice'),
     'not a number': (['link_a'], [([nan], 5.0, {})], 'nan'),
     'too few': (['link_a', 'link_b'], [([0.1], 5.0, {})], '2 names but 1'),

@@ -58,7 +58,7 @@ class Record:
 
 
 @pytest.fixture
-def record(domain, nursery, tmp_path, tmp_path_factory):
+def record(domain, fork_server, tmp_path, tmp_path_factory):
     """
     Return a function that starts `fourbar record`; what is left of it ends with the test.
 
@@ -71,7 +71,7 @@ def record(domain, nursery, tmp_path, tmp_path_factory):
 
         def begin(out, err):
             if not fresh:
-                return nursery.start(command, tmp_path, out, err, environment)
+                return fork_server.start(command, tmp_path, out, err, environment)
             with out.open('wb') as out_file, err.open('wb') as err_file:
                 return subprocess.Popen(
                     [sys.executable, '-m', 'fourbar_ros', *command], cwd=tmp_path,

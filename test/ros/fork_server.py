@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Processes of the package that are forked from one which has imported everything already.
+A server that forks processes of the package after all imports.
 
-What a node imports takes more than a second of its start, and the tests start hundreds. Run as a
-script this is the parent of them all. It never initialises ROS, and has no threads but the idle
-tracers of the middleware, so a child begins where `python -m fourbar_ros` would be after its
-imports, and ends as that would.
+The imports of a node take more than a second, and the tests start hundreds of nodes. Run as a
+script, this module is the parent of these processes. It never initialises ROS and has no threads
+but the idle tracers of the middleware, so a child starts where `python -m fourbar_ros` is after its
+imports, and ends like it.
 """
 
 import gc
@@ -19,8 +19,8 @@ import sys
 import time
 
 
-class Nursery:
-    """The parent of forked processes, there from the first one on until `close`."""
+class ForkServer:
+    """The parent of forked processes; it starts with the first request and ends with `close`."""
 
     def __init__(self):
         self._process = None
@@ -31,12 +31,12 @@ class Nursery:
             self._process = subprocess.Popen(
                 [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 text=True,
-                # More would be threads that a fork leaves behind; nothing here is large.
+                # A fork would lose further threads of BLAS; no array here is large.
                 env={**os.environ, 'OPENBLAS_NUM_THREADS': '1'})
         self._process.stdin.write(json.dumps(request) + '\n')
         self._process.stdin.flush()
         answer = self._process.stdout.readline()
-        assert answer, 'the nursery is gone'
+        assert answer, 'the fork server has ended'
         return json.loads(answer)
 
     def start(self, arguments, folder, out, err, environment):
@@ -61,15 +61,15 @@ class Forked:
     :ivar returncode: as that of Popen, None while nobody has noticed the end.
     """
 
-    def __init__(self, nursery, pid):
-        self._nursery = nursery
+    def __init__(self, fork_server, pid):
+        self._fork_server = fork_server
         self.pid = pid
         self.returncode = None
 
     def poll(self):
         """Return the exit code, None while it runs."""
         if self.returncode is None:
-            self.returncode = self._nursery.ask(poll=self.pid)
+            self.returncode = self._fork_server.ask(poll=self.pid)
         return self.returncode
 
     def wait(self, timeout=None):
