@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.loop.scenario import OLD_MODEL_KEY, read_scenario, scenario_from, ScenarioError
+from fourbar_ros.loop.scenario import read_scenario, scenario_from, ScenarioError
 from fourbar_ros.mechanism import Mechanism
 
 
@@ -42,7 +42,7 @@ def describe(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """
     scenario = scenario_from(values, folder)
     return {
-        'mechanism': _keys_of(scenario.mechanism), OLD_MODEL_KEY: _keys_of(scenario.model),
+        'mechanism': _keys_of(scenario.mechanism), 'model': _keys_of(scenario.model),
         'table': _lists(asdict(scenario.table)), 'seed': scenario.seed,
         'duration': scenario.duration, 'initial': asdict(scenario.initial),
         'plant': asdict(scenario.plant), 'estimator': asdict(scenario.estimator),

@@ -26,25 +26,15 @@ from fourbar_ros.device import SupervisorSettings
 from fourbar_ros.estimation import EstimatorSettings
 from fourbar_ros.estimation.estimator_settings import SETTINGS as ESTIMATOR
 from fourbar_ros.mechanism import assemble, LINK_NAMES, load_mechanism, Mechanism
-from fourbar_ros.mechanism.closure import BRANCHES
 from fourbar_ros.mechanism.constants import Array
-from fourbar_ros.plant import InitialState, load_table, Table
+from fourbar_ros.plant import InitialState, load_table, SimulationSettings, Table
 
 # Longest duration [s]: the memory of a run grows with it.
 LONGEST_RUN = 3600.0
 # Deprecated name of the key `model`.
 OLD_MODEL_KEY = 'believed'
 
-_STEP = Setting('step', 5e-4, 's', 'integration step; the period is a whole multiple of it',
-                low=1e-6, high=0.1)
-_SEED = Setting('seed', 0, '', 'of all random numbers', low=0, high=2 ** 63 - 1)
-_INITIAL = (
-    Setting('link_a', 0.0, 'rad', 'orientation of link a', low=-1e6, high=1e6),
-    Setting('link_b', 0.0, 'rad', 'orientation of link b', low=-1e6, high=1e6),
-    Setting('branch', 'open', '', 'assembly', choices=BRANCHES),
-    Setting('rate_a', 0.0, 'rad/s', 'rate of link a', low=-100.0, high=100.0),
-    Setting('rate_b', 0.0, 'rad/s', 'rate of link b', low=-100.0, high=100.0),
-)
+_STEP, _SEED = settings_of(SimulationSettings)
 _DURATION = Setting('duration', 0.0, 's', 'time from the first tick to the last',
                     low=1e-6, high=LONGEST_RUN)
 _ANGLE = Setting('', 0.0, 'rad', 'orientation of a link, or change of it', low=-1e6, high=1e6)
@@ -197,7 +187,7 @@ def scenario_from(values: Mapping[str, Any], folder: Path) -> Scenario:
             # A scenario names two mechanisms: the message says which one is refused.
             raise error.at(key, ScenarioError) from None
     table_name, table = _table(values['table'], folder)
-    initial = _section('initial', InitialState, _INITIAL, values)
+    initial = _section('initial', InitialState, settings_of(InitialState), values)
     plant = _section('plant', PlantSettings, settings_of(PlantSettings), values)
     start = assemble(mechanism, initial.link_a, initial.link_b, initial.branch)
     duration = _check(_DURATION, values['duration'])

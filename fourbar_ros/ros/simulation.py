@@ -6,20 +6,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
-from math import cos, pi, sin
+from dataclasses import fields, replace
+from math import cos, sin
 from typing import Any
 
 from fourbar_ros.common import names
-from fourbar_ros.common.settings import Setting
+from fourbar_ros.common.settings import Setting, settings_of
 from fourbar_ros.device import TrueState
 from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism, SENSOR_NAMES
-from fourbar_ros.mechanism.closure import BRANCHES
-from fourbar_ros.plant import InitialState, load_table, Plant
+from fourbar_ros.plant import InitialState, load_table, Plant, SimulationSettings
 from fourbar_ros.plant.energy_budget import EnergyBudget
 from fourbar_ros.plant.fault_schedule import read_schedule
-from fourbar_ros.ros.base_node import BaseNode
+from fourbar_ros.ros.base_node import BaseNode, settings_from
 from fourbar_ros.ros.messages import JointStatePublisher, RELIABLE, TABLE_FRAME, write_stamp
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -41,25 +40,16 @@ def table_parameters(table: str) -> tuple[Setting, ...]:
     """
     return (
         Setting('table', table, '', 'preset or path of a table file'),
-        Setting('step', 0.0005, 's', 'integration step; the period is a whole multiple of it',
-                low=1e-6, high=0.1),
-        Setting('seed', 0, '', 'of all random numbers', low=0, high=2 ** 63 - 1),
+        *settings_of(SimulationSettings),
         Setting('fault_schedule', '', '', 'path of a YAML file of faults that come and go',
                 live=True),
         *(Setting(f'fault.{name}', '', '', 'fault of the sensor, as `off` or `wrong 0.1`',
                   live=True) for name in SENSOR_NAMES),
         *(Setting(f'fault.{name}', '', '', 'fault of the wheel, as `dead` or `weak 0.5`',
                   live=True) for name in FLYWHEEL_NAMES),
-        Setting('initial.link_a', 0.0, 'rad', 'orientation of link a at start and reset',
-                low=-1e6, high=1e6, live=True),
-        Setting('initial.link_b', round(pi / 3, 12), 'rad',
-                'orientation of link b at start and reset', low=-1e6, high=1e6, live=True),
-        Setting('initial.branch', 'open', '', 'assembly at start and reset', choices=BRANCHES,
-                live=True),
-        Setting('initial.rate_a', 0.0, 'rad/s', 'rate of link a at start and reset',
-                low=-100.0, high=100.0, live=True),
-        Setting('initial.rate_b', 0.0, 'rad/s', 'rate of link b at start and reset',
-                low=-100.0, high=100.0, live=True),
+        # Twelve digits of the defaults are legible in a parameters file.
+        *(replace(row, default=round(row.default, 12)) if row.kind is float else row
+          for row in settings_of(InitialState, 'initial.')),
     )
 
 
@@ -69,8 +59,7 @@ FAULT_PARAMETERS = tuple(
 
 def initial_state(values: Mapping[str, Any]) -> InitialState:
     """Return the initial state that the parameters describe."""
-    return InitialState(**{name.partition('.')[2]: value for name, value in values.items()
-                           if name.startswith('initial.')})
+    return settings_from(InitialState, values, 'initial.')
 
 
 def make_table(values: Mapping[str, Any], period_ns: int) -> SimulatedTable:

@@ -85,7 +85,7 @@ def test_script_acts_from_the_next_tick_on() -> None:
         setpoints=(ScriptedSetpoint(0.199, ('link_a',), (0.1,), 0.2),))
     found = record_run(scenario).arrays()
     commanded = np.flatnonzero(found['flywheel_command.effort'].any(axis=1))
-    # Tick 25 is at 0.1 s; the device is armed after it, and the next tick is the first with torque.
+    # Tick 25 is at 0.1 s; the device is armed after it, and the next tick has the first torque.
     assert commanded[0] == 26
     moving = np.flatnonzero(found['reference.velocity'].any(axis=1))
     # Tick 50 is the first after 0.199 s, and the move is over after 50 more.

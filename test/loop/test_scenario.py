@@ -377,8 +377,8 @@ def test_description_makes_the_same_scenario(name: str) -> None:
 def test_description_keeps_relative_setpoints_and_the_model(written: Write) -> None:
     description = load_description(written({**GOOD, 'model': 'prototype'}))
     assert description['setpoints'][1]['relative'] == {'link_d': -1}
-    assert description['believed'] != description['mechanism']
-    assert load_description(written(GOOD))['believed'] == description['mechanism']
+    assert description['model'] != description['mechanism']
+    assert load_description(written(GOOD))['model'] == description['mechanism']
 
 
 def test_nodes_need_files_and_no_descriptions() -> None:
@@ -390,7 +390,7 @@ def test_nodes_need_files_and_no_descriptions() -> None:
 
 @pytest.mark.parametrize(('place', 'value', 'parts'), [
     ('mechanism.link_masses', [0.02, 0.02, 0.02, -1.0], ['link_masses', 'link_d']),
-    ('believed.link_masses', [0.02, 0.02, 0.02, -1.0], ['believed', 'link_masses', 'link_d']),
+    ('model.link_masses', [0.02, 0.02, 0.02, -1.0], ['model', 'link_masses', 'link_d']),
     ('mechanism.weight', 1.0, ['mechanism', 'weight']),
     ('table.joints.coulomb', -1.0, ['table', 'joints.coulomb']),
 ])

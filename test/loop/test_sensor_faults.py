@@ -99,7 +99,7 @@ def test_wheels_alone_carry_it_for_a_second_and_then_it_says_that_it_is_lost(
 
 
 def test_no_sensor_is_reported_without_a_fault(scenario: Scenario) -> None:
-    """Without a fault no sensor is reported; the campaign of a hundred runs is `study consistency`."""
+    """Without a fault no sensor is reported; a hundred runs are in `study consistency`."""
     for seed in range(2):
         loop = make_loop(replace(scenario, seed=100 + seed))
         for _ in quarter_turn(loop):

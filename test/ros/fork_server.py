@@ -6,8 +6,8 @@ A server that forks processes of the package after all imports.
 
 The imports of a node take more than a second, and the tests start hundreds of nodes. Run as a
 script, this module is the parent of these processes. It never initialises ROS and has no threads
-but the idle tracers of the middleware, so a child starts where `python -m fourbar_ros` is after its
-imports, and ends like it.
+but the idle tracers of the middleware, so a child starts where `python -m fourbar_ros` is after
+its imports, and ends like it.
 """
 
 import gc

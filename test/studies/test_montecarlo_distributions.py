@@ -139,7 +139,7 @@ def test_set_changes_mechanism_and_model() -> None:
 
 def test_scenario_with_its_own_model_keeps_it(tmp_path: Path) -> None:
     described = load_description('prototype')
-    described['believed']['link_masses'] = [0.4, 0.4, 0.4, 0.4]
+    described['model']['link_masses'] = [0.4, 0.4, 0.4, 0.4]
     (tmp_path / 'mine.yaml').write_text(yaml.safe_dump(described))
     made = campaign_from({'scenario': 'mine.yaml', 'set': {'mechanism.link_masses.a': 0.7},
                           'vary': {'initial.link_a': {'uniform': [0.0, 0.1]}}}, tmp_path)

@@ -22,7 +22,7 @@ from fourbar_ros.studies.campaigns import CampaignError
 Place = tuple[str | int, ...]
 
 # Key of the mechanism that estimator and controller assume, in the description of a scenario.
-MODEL = 'believed'
+MODEL = 'model'
 # Its names in campaign files; the second one is deprecated.
 MODEL_NAMES = ('model', 'believed')
 # Keys that each run sets by itself.
