@@ -17,10 +17,10 @@ from math import isfinite
 
 from fourbar_ros.common.errors import FourbarError
 
+# Start of simulated time [ns]; other nodes take 0 for `now` or `never`.
 FIRST_STAMP_NS = 1_000_000_000
-"""Start of simulated time [ns]; other nodes take 0 for `now` or `never`."""
+# Longest interval at which a tick without an answer is sent again [ns].
 MAX_REPEAT_NS = 10_000_000_000
-"""Longest interval at which a tick without an answer is sent again [ns]."""
 
 
 class ClockModeError(FourbarError):

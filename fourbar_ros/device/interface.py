@@ -123,12 +123,12 @@ class Samples:
 class Reaction(IntEnum):
     """Reaction to a fault, in the order of severity."""
 
+    # Report in diagnostics only.
     WARN = 0
-    """Report in diagnostics only."""
+    # Disarm: the wheels have no power.
     COAST = 1
-    """Disarm: the wheels have no power."""
+    # Emergency stop: the wheels have no power until a reset.
     STOP = 2
-    """Emergency stop: the wheels have no power until a reset."""
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,8 @@ from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
 TIMEOUT_ACTIONS = ('coast', 'hold_speed', 'brake')
+# Number of lost ticks whose late answers are still timed.
 MAX_LATE_TICKS = 100
-"""Number of lost ticks whose late answers are still timed."""
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,8 @@ _BUS_COUNTERS = {'foreign': 'datagrams_foreign', 'malformed': 'datagrams_malform
 # Interfaces that stamp received frames with system time, so that the wait in the receive buffer
 # is known.
 SYSTEM_TIME = ('socketcan', 'fourbar_udp')
+# Larger differences to system time are taken for the adapter's own clock [s].
 MAX_FRAME_AGE_S = 1.0
-"""Larger differences to system time are taken for the adapter's own clock [s]."""
 
 # Error frames of SocketCAN (linux/can/error.h): bits of the identifier, and bits of the second
 # byte for the state `error passive`.

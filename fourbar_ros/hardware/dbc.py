@@ -32,8 +32,8 @@ _LARGEST_FLOAT = {16: 65504.0, 32: 3.4028234663852886e38, 64: 1.7976931348623157
 # Relative tolerance of limits; float32 has a relative precision of 1.2e-7.
 _TOLERANCE = 1e-6
 
+# Label in a signal's value table of the count that means `no measurement`.
 NO_VALUE = 'none'
-"""Label in a signal's value table of the count that means `no measurement`."""
 CHECKSUM = 'CHECKSUM'
 
 
@@ -41,7 +41,8 @@ class DbcError(FourbarError):
     """
     A DBC file that is missing, malformed, or lacks a message or signal.
 
-    Its `values` are those of `file`, `message`, `signal`, `value` and `limit` that apply.
+    Its `values` are `place` (the file), and those of `message`, `signal`, `value` and `limit` that
+    apply.
     """
 
 
@@ -103,8 +104,8 @@ class Number(SignalCodec):
     :param optional: whether None is a value, sent as the count that the file labels `none`.
     """
 
+    # Smallest allowed value, beside the limits of the file.
     minimum = -inf
-    """Smallest allowed value, beside the limits of the file."""
 
     def __init__(self, low: float = 0.0, high: float = 0.0, optional: bool = False) -> None:
         self._required = low, high
@@ -278,7 +279,8 @@ class Integer(SignalCodec):
 
     def __init__(self, choices: int, kind: type[Any] = int) -> None:
         self._choices = choices
-        self._kind = kind
+        # Made once, since the construction of an enumeration is slow.
+        self._values = None if kind is int else [kind(n) for n in range(choices)]
 
     def _bind(self, signal: Signal) -> None:
         if signal.is_float or signal.is_signed or signal.scale != 1 or signal.offset != 0:
@@ -297,11 +299,12 @@ class Integer(SignalCodec):
 
     def decode(self, count: float) -> Any:
         """Return the value of a count."""
-        return self._kind(self.encode(int(count)))
+        integer = self.encode(int(count))
+        return integer if self._values is None else self._values[integer]
 
 
 class Constant(Integer):
-    """An 8-bit integer that is always the same; its value is None."""
+    """An 8-bit integer that is always the same."""
 
     def __init__(self, code: int) -> None:
         super().__init__(256)
@@ -309,12 +312,9 @@ class Constant(Integer):
 
     def encode(self, value: int | None) -> int:
         """Return the constant."""
-        return self._code
-
-    def decode(self, count: float) -> None:
-        """Check the constant."""
-        if count != self._code:
-            raise self._refusal(int(count), str(self._code), self._code)
+        if value != self._code:
+            raise self._refusal(value, str(self._code), self._code)
+        return value
 
 
 class Flags(Integer):
@@ -382,11 +382,15 @@ class MessageCodec:
 
         :raises FrameError: a value does not fit.
         """
-        signals = self.signals
-        counts = {name: signals[name].encode(value) for name, value in values.items()}
+        return self.pack({name: self.signals[name].encode(value)
+                          for name, value in values.items()})
+
+    def pack(self, counts: Mapping[str, float]) -> Frame:
+        """Return the frame of signal counts."""
         data = self._pack({**self._zeros, **counts}, False, False, False)
         if self._has_checksum:
-            data = data[:-1] + bytes((checksum(self.frame_id, data[:-1]),))
+            data = data[:-1]
+            data += bytes((checksum(self.frame_id, data),))
         return Frame(self.frame_id, data)
 
     def decode(self, frame: Frame) -> dict[str, Any]:
@@ -394,6 +398,15 @@ class MessageCodec:
         Return the signal values of a frame.
 
         :raises FrameError: wrong length, wrong checksum, or an invalid value.
+        """
+        counts = self.unpack(frame)
+        return {name: codec.decode(counts[name]) for name, codec in self.signals.items()}
+
+    def unpack(self, frame: Frame) -> dict[str, Any]:
+        """
+        Return the signal counts of a frame.
+
+        :raises FrameError: wrong length or wrong checksum.
         """
         data = frame.data
         if len(data) != self._length:
@@ -404,7 +417,7 @@ class MessageCodec:
             raise FrameError('checksum', f'{self.name} (0x{self.frame_id:03X}): wrong checksum',
                              name=self.name, value=data[-1])
         counts: dict[str, Any] = self._unpack(data, False, False)
-        return {name: codec.decode(counts[name]) for name, codec in self.signals.items()}
+        return counts
 
 
 class DbcFile:
@@ -418,23 +431,23 @@ class DbcFile:
     """
 
     def __init__(self, name: str) -> None:
-        self.path = _find(name)
+        self.path = _find_file(name)
         try:
             import cantools.database
         except ImportError as error:
             raise DbcError(f'{self.path}: cantools is missing: pip install fourbar_ros[hardware]',
-                           file=str(self.path)) from error
+                           place=str(self.path)) from error
         # It warns of identifiers that occur twice; `message` refuses those.
         logging.getLogger('cantools').addHandler(logging.NullHandler())
         logging.getLogger('cantools').propagate = False
         try:
             database = cantools.database.load_file(self.path, database_format='dbc')
         except OSError as error:
-            raise DbcError(f'{self.path}: {error.strerror}', file=str(self.path)) from error
+            raise DbcError(f'{self.path}: {error.strerror}', place=str(self.path)) from error
         except Exception as error:
             # The parser raises many kinds of errors for a malformed line.
             raise DbcError(f'{self.path}: not a usable DBC file: {" ".join(str(error).split())}',
-                           file=str(self.path)) from error
+                           place=str(self.path)) from error
         self._messages: list[Message] = list(getattr(database, 'messages', ()))
 
     def message(self, name: str, signals: Mapping[str, SignalCodec], has_checksum: bool = True
@@ -444,25 +457,25 @@ class DbcFile:
 
         :raises DbcError: the message is missing, ambiguous, or does not meet the requirements.
         """
-        matches = [message for message in self._messages if message.name == name]
-        if len(matches) != 1:
-            number = 'more than one' if matches else 'no'
-            raise DbcError(f'{self.path}: {number} message {name}', file=str(self.path),
-                           message=name)
-        for other in self._messages:
-            if other is not matches[0] and (other.frame_id, other.is_extended_frame) == (
-                    matches[0].frame_id, matches[0].is_extended_frame):
-                raise DbcError(f'{self.path}: {name} and {other.name} have the same identifier '
-                               f'0x{other.frame_id:03X}', file=str(self.path), message=name,
-                               value=other.frame_id)
         try:
-            return MessageCodec(matches[0], signals, has_checksum)
+            return MessageCodec(self._find(name), signals, has_checksum)
         except DbcError as error:
-            raise DbcError(f'{self.path}: {error}', **{
-                'file': str(self.path), **error.values}) from None
+            raise error.at(self.path, DbcError) from None
+
+    def _find(self, name: str) -> Message:
+        matches = [each for each in self._messages if each.name == name]
+        if len(matches) != 1:
+            raise DbcError(f'{"more than one" if matches else "no"} message {name}', message=name)
+        message, = matches
+        for other in self._messages:
+            if other is not message and (other.frame_id, other.is_extended_frame) == (
+                    message.frame_id, message.is_extended_frame):
+                raise DbcError(f'{name} and {other.name} have the same identifier '
+                               f'0x{other.frame_id:03X}', message=name, value=other.frame_id)
+        return message
 
 
-def _find(name: str) -> Path:
+def _find_file(name: str) -> Path:
     path = Path(name).expanduser()
     if '/' not in name and path.suffix != '.dbc':
         folder = share_directory() / 'config'

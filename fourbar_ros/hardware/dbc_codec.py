@@ -27,16 +27,7 @@ from fourbar_ros.hardware.dbc import (
     SignalCodec,
     UpperLimit,
 )
-from fourbar_ros.hardware.messages import (
-    COUNTERS,
-    Frame,
-    FrameError,
-    LINK_FAULTS,
-    LinkState,
-    SEQUENCES,
-    ToHost,
-    ToLinks,
-)
+from fourbar_ros.hardware.messages import COUNTERS, Frame, LINK_FAULTS, LinkState, SEQUENCES
 
 LINK_LETTERS = 'ABCD'
 
@@ -63,8 +54,8 @@ _TIME = ('TIME', Modulo(2e6, whole=True))
 
 _TO_ALL_LINKS = (
     _Row(messages.Sync, 'SYNC', {'counter': _COUNTER}),
-    _Row(messages.Stop, 'STOP', {'code': ('CODE', Constant(0xC3))}),
-    _Row(messages.Release, 'RELEASE', {'code': ('CODE', Constant(0x3C))}),
+    _Row(messages.Stop, 'STOP', {'code': ('CODE', Constant(messages.Stop.code))}),
+    _Row(messages.Release, 'RELEASE', {'code': ('CODE', Constant(messages.Release.code))}),
 )
 _TO_ONE_LINK = (
     _Row(messages.Command, 'COMMAND', {
@@ -106,24 +97,26 @@ class _Message:
         prefix = '' if link is None else f'LINK_{LINK_LETTERS[link]}_'
         self.codec: MessageCodec = file.message(prefix + row.name, dict(row.signals.values()))
         self._kind = row.kind
-        self._names = {attribute: name for attribute, (name, _) in row.signals.items()}
-        self._decoded = {attribute: name for attribute, name in self._names.items()
-                         if not isinstance(self.codec.signals[name], Constant)}
+        # Attribute, name of the signal, and its conversion; faster than `encode` and `decode`.
+        signals = [(attribute, name, self.codec.signals[name])
+                   for attribute, (name, _) in row.signals.items()]
+        self._encoders = [(attribute, name, signal.encode) for attribute, name, signal in signals]
+        self._decoders = [(attribute, name, signal.decode) for attribute, name, signal in signals]
         self._constants: dict[str, Any] = {} if link is None else {'link': link}
         for attribute, other in _PERIODS.items():
             if attribute in row.kind.__dataclass_fields__:
-                signal = self.codec.signals[self._names[other]]
+                signal = self.codec.signals[row.signals[other][0]]
                 assert isinstance(signal, Modulo)
                 self._constants[attribute] = signal.period
 
     def encode(self, message: Any) -> Frame:
-        return self.codec.encode({name: getattr(message, attribute, None)
-                                  for attribute, name in self._names.items()})
+        return self.codec.pack({name: encode(getattr(message, attribute))
+                                for attribute, name, encode in self._encoders})
 
     def decode(self, frame: Frame) -> Any:
-        values = self.codec.decode(frame)
+        counts = self.codec.unpack(frame)
         return self._kind(**self._constants, **{
-            attribute: values[name] for attribute, name in self._decoded.items()})
+            attribute: decode(counts[name]) for attribute, name, decode in self._decoders})
 
 
 class DbcCodec:
@@ -156,50 +149,49 @@ class DbcCodec:
                 decoders[message.codec.frame_id] = message
         self.frame_ids = frozenset(self._from_host) | frozenset(self._from_links)
 
-    def to_links(self, message: ToLinks) -> Sequence[Frame]:
+    def to_links(self, message: messages.ToLinks) -> Sequence[Frame]:
         """
         Encode a message of the host.
 
-        :raises FrameError: kind `value`: a number is not finite or does not fit.
+        :raises messages.FrameError: kind `value`: a number is not finite or does not fit.
         """
         return self._encode(message)
 
-    def to_host(self, message: ToHost) -> Sequence[Frame]:
+    def to_host(self, message: messages.ToHost) -> Sequence[Frame]:
         """
         Encode a message of a link.
 
-        :raises FrameError: kind `value`, as :meth:`to_links`.
+        :raises messages.FrameError: kind `value`, as :meth:`to_links`.
         """
         return self._encode(message)
 
-    def from_links(self, frame: Frame) -> ToHost | None:
+    def from_links(self, frame: Frame) -> messages.ToHost | None:
         """
         Decode at the host a message of a link.
 
         :returns: the message; None for a frame that no link sends.
-        :raises FrameError: wrong length, wrong checksum, or an invalid value.
+        :raises messages.FrameError: wrong length, wrong checksum, or an invalid value.
         """
-        message: ToHost | None = _decode(self._from_links, frame)
+        message: messages.ToHost | None = _decode(self._from_links, frame)
         return message
 
-    def from_host(self, frame: Frame) -> ToLinks | None:
+    def from_host(self, frame: Frame) -> messages.ToLinks | None:
         """
         Decode at a link a message of the host.
 
         :returns: the message; None for a frame that the host does not send.
-        :raises FrameError: as :meth:`from_links`.
+        :raises messages.FrameError: as :meth:`from_links`.
         """
-        message: ToLinks | None = _decode(self._from_host, frame)
+        message: messages.ToLinks | None = _decode(self._from_host, frame)
         return message
 
-    def _encode(self, message: ToLinks | ToHost) -> Sequence[Frame]:
+    def _encode(self, message: messages.ToLinks | messages.ToHost) -> Sequence[Frame]:
         link = getattr(message, 'link', None)
         encoder = self._encoders.get((type(message), link))
         if encoder is not None:
             return (encoder.encode(message),)
-        if link is not None and not 0 <= link < len(LINK_LETTERS):
-            raise FrameError('value', f'link must be 0 to {len(LINK_LETTERS) - 1}, got {link}',
-                             name='link', value=link, limit=(0, len(LINK_LETTERS) - 1))
+        if link is not None:
+            messages.check_link(link)
         return ()
 
 

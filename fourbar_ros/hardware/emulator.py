@@ -27,21 +27,21 @@ import numpy as np
 
 LINKS = range(4)
 
+# Period of reported wheel angles [rad]: 24 bits of the DBC signal, 16 bits per turn.
 TURN = 256 * 2.0 * np.pi
-"""Period of reported wheel angles [rad]: 24 bits of the DBC signal, 16 bits per turn."""
+# Period of link times in reports [us]: 20 bits of 10 us.
 WRAP_US = 10 * 2 ** 20
-"""Period of link times in reports [us]: 20 bits of 10 us."""
+# Number of `Sync` between two clock reports.
 CLOCK_EVERY = 16
-"""Number of `Sync` between two clock reports."""
+# Interval of heartbeats [ns].
 HEARTBEAT_NS = 50_000_000
-"""Interval of heartbeats [ns]."""
+# Longest delay of this process after which no step is skipped [ns].
 CATCH_UP_NS = 100_000_000
-"""Longest delay of this process after which no step is skipped [ns]."""
 
 INJECTABLE_LINK_FAULTS = (
     'silent', 'hot', 'low_battery', 'reboot', 'corrupted', 'foreign', 'replayed')
+# Faults of the electronics and the bus; those of sensors and wheels belong to the table.
 INJECTABLE_BUS_FAULTS = ('off',)
-"""Faults of the electronics and the bus; those of sensors and wheels belong to the table."""
 
 
 class EmulatorError(FourbarError):

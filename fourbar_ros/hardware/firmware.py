@@ -10,14 +10,14 @@ from math import copysign
 
 from fourbar_ros.hardware.messages import Command, COUNTERS, Limits, LinkState
 
+# Ratio of wheel speed to speed limit above which a link reports `overspeed`; the margin covers the
+# overshoot of a speed controller at the limit.
 OVERSPEED = 1.2
-"""Ratio of wheel speed to speed limit above which a link reports `overspeed`; the margin covers
-the overshoot of a speed controller at the limit."""
 
 
+# Limits at which a link cuts the power [deg C], [V]; beyond those of the host's safety rules, so
+# that the host reacts first.
 MAX_TEMPERATURE, MIN_VOLTAGE = 95.0, 9.5
-"""Limits at which a link cuts the power [deg C], [V]; beyond those of the host's safety rules, so
-that the host reacts first."""
 
 
 class Firmware:

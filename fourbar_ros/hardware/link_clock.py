@@ -13,26 +13,26 @@ from __future__ import annotations
 
 from math import sqrt
 
+# Initial standard deviation of the drift: tolerance of two quartz oscillators [s/s].
 INITIAL_DRIFT = 1e-4
-"""Initial standard deviation of the drift: tolerance of two quartz oscillators [s/s]."""
+# Random walk of the drift, by temperature [s/s per sqrt(s)].
 DRIFT_RANDOM_WALK = 1e-7
-"""Random walk of the drift, by temperature [s/s per sqrt(s)]."""
+# Smallest standard deviation of a measurement [s].
 MIN_NOISE = 2e-5
-"""Smallest standard deviation of a measurement [s]."""
+# Standard deviation from unequal delays of the two directions, as a share of the shortest round
+# trip. With this share an exchange that is slow in one direction only stays within the gate.
 ASYMMETRY = 0.1
-"""Standard deviation from unequal delays of the two directions, as a share of the shortest round
-trip. With this share an exchange that is slow in one direction only stays within the gate."""
+# Longer exchanges are ignored [s].
 MAX_ROUND_TRIP = 0.05
-"""Longer exchanges are ignored [s]."""
+# The estimate has settled after this number of exchanges, below this standard deviation [s].
 SETTLED_EXCHANGES, SETTLED_SIGMA = 4, 3e-4
-"""The estimate has settled after this number of exchanges, below this standard deviation [s]."""
+# Innovation gate, in standard deviations.
 GATE = 6.0
-"""Innovation gate, in standard deviations."""
+# Consecutive exchanges outside the gate after which the link's clock has restarted.
 RESTART_AFTER = 5
-"""Consecutive exchanges outside the gate after which the link's clock has restarted."""
+# Weight of a new squared innovation in their mean; growth of the shortest round trip per exchange,
+# so that it follows a bus that becomes slower.
 SMOOTHING, FORGETTING = 0.05, 1.002
-"""Weight of a new squared innovation in their mean; growth of the shortest round trip per
-exchange, so that it follows a bus that becomes slower."""
 
 
 class LinkClock:

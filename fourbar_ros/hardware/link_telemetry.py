@@ -8,28 +8,20 @@ from __future__ import annotations
 from collections import Counter, deque
 from math import pi, remainder
 
+from fourbar_ros.hardware import messages
 from fourbar_ros.hardware.link_clock import LinkClock
-from fourbar_ros.hardware.messages import (
-    AngleReport,
-    ClockReport,
-    COUNTERS,
-    Heartbeat,
-    LinkState,
-    MotorReport,
-    SEQUENCES,
-    WheelReport,
-)
+from fourbar_ros.hardware.messages import COUNTERS, Heartbeat, LinkState, SEQUENCES
 
+# A time of measurement may be later than the arrival by this, the error of the clock estimate
+# [ns].
 MAX_STAMP_AHEAD_NS = 2_000_000
-"""A time of measurement may be later than the arrival by this, the error of the clock estimate
-[ns]."""
+# Maximum age of a sample on arrival [ns].
 MAX_SAMPLE_AGE_NS = 500_000_000
-"""Maximum age of a sample on arrival [ns]."""
+# After this time without a heartbeat any sequence number is accepted [ns]; longer than the limit
+# of `heartbeat_lost`.
 HEARTBEAT_REORDER_NS = 1_000_000_000
-"""After this time without a heartbeat any sequence number is accepted [ns]; longer than the limit
-of `heartbeat_lost`."""
+# Two boot numbers that alternate within this time are two links with one identifier [ns].
 DUPLICATE_WINDOW_NS = 3_000_000_000
-"""Two boot numbers that alternate within this time are two links with one identifier [ns]."""
 
 
 class LinkTelemetry:
@@ -81,8 +73,8 @@ class LinkTelemetry:
         """Number of answers that this cycle still lacks, of wheel and motor."""
         return (not self._wheel_answered) + (not self._motor_answered)
 
-    def update_wheel(self, report: WheelReport, counter: int, sent_ns: int, arrival_ns: int
-                     ) -> None:
+    def update_wheel(self, report: messages.WheelReport, counter: int, sent_ns: int,
+                     arrival_ns: int) -> None:
         """
         Process the answer of the wheel encoder.
 
@@ -112,7 +104,7 @@ class LinkTelemetry:
         self.wheel_angle, self.wheel_ns = angle, measured_ns
         self.answer_ns, self._wheel_answered = arrival_ns, True
 
-    def update_motor(self, report: MotorReport, counter: int) -> None:
+    def update_motor(self, report: messages.MotorReport, counter: int) -> None:
         """
         Process the answer of the motor.
 
@@ -124,7 +116,7 @@ class LinkTelemetry:
             if report.state is not None:
                 self.state = report.state
 
-    def update_angle(self, report: AngleReport, arrival_ns: int) -> None:
+    def update_angle(self, report: messages.AngleReport, arrival_ns: int) -> None:
         """Process a sample of the angle sensor."""
         measured_ns = self._measured_ns(report.time_us, report.wrap_us, arrival_ns)
         if measured_ns is None:
@@ -146,7 +138,8 @@ class LinkTelemetry:
         self.angle_ns = measured_ns
         self.angles.append((measured_ns, remainder(report.angle, 2.0 * pi), report.rate))
 
-    def update_clock(self, report: ClockReport, sent_ns: int | None, arrival_ns: int) -> None:
+    def update_clock(self, report: messages.ClockReport, sent_ns: int | None, arrival_ns: int
+                     ) -> None:
         """
         Process the link time at which a `Sync` arrived.
 

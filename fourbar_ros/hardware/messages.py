@@ -77,21 +77,21 @@ class LinkState(IntEnum):
 
     IDLE = 0
     ARMED = 1
+    # Command timeout: no torque until the link is disarmed and armed again.
     COASTING = 2
-    """Command timeout: no torque until the link is disarmed and armed again."""
+    # Emergency stop: no torque until it is released.
     STOPPED = 3
-    """Emergency stop: no torque until it is released."""
+    # Own fault: no torque until the cause is gone and the link is disarmed and armed again.
     FAULT = 4
-    """Own fault: no torque until the cause is gone and the link is disarmed and armed again."""
 
 
+# Number of values of 8-bit counters (`Sync`, commands, boots) and of 4-bit sequence numbers (angle
+# samples, heartbeats).
 COUNTERS, SEQUENCES = 256, 16
-"""Number of values of 8-bit counters (`Sync`, commands, boots) and of 4-bit sequence numbers
-(angle samples, heartbeats)."""
 
+# Faults of a link, in the order of the bits; `no_limits`: no limits are loaded.
 LINK_FAULTS = ('driver', 'encoder', 'angle_sensor', 'overspeed', 'overtemperature',
                'undervoltage', 'no_limits')
-"""Faults of a link, in the order of the bits; `no_limits`: no limits are loaded."""
 
 
 # From the host to one link.
@@ -139,12 +139,24 @@ class Sync:
 
 @dataclass(frozen=True)
 class Stop:
-    """Emergency stop: no power on any wheel until `Release`."""
+    """
+    Emergency stop: no power on any wheel until `Release`.
+
+    :param code: fixed; a corrupted frame with another identifier is not accepted for this one.
+    """
+
+    code: int = 0xC3
 
 
 @dataclass(frozen=True)
 class Release:
-    """End of the emergency stop; the links become idle."""
+    """
+    End of the emergency stop; the links become idle.
+
+    :param code: fixed, as that of `Stop`.
+    """
+
+    code: int = 0x3C
 
 
 # From a link to the host.
@@ -282,3 +294,14 @@ class Codec(Protocol):
         :returns: the message; None for a frame that the host does not send.
         :raises FrameError: as :meth:`from_links`.
         """
+
+
+def check_link(link: int) -> None:
+    """
+    Check the number of a link.
+
+    :raises FrameError: kind `value`: not 0 to 3.
+    """
+    if link not in range(4):
+        raise FrameError('value', f'link must be 0 to 3, got {link}', name='link', value=link,
+                         limit=(0, 3))

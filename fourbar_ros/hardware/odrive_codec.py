@@ -12,11 +12,13 @@ prototype's messages SYNC, ANGLE and CLOCK; their identifiers do not collide wit
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import isfinite, tau
 from typing import Any
 
+from fourbar_ros.hardware import messages
 from fourbar_ros.hardware.dbc import (
     DbcError,
     DbcFile,
@@ -27,22 +29,7 @@ from fourbar_ros.hardware.dbc import (
     UpperLimit,
 )
 from fourbar_ros.hardware.dbc_codec import DbcCodec
-from fourbar_ros.hardware.messages import (
-    BusError,
-    Command,
-    Frame,
-    FrameError,
-    Heartbeat,
-    Limits,
-    LinkState,
-    MotorReport,
-    Release,
-    Stop,
-    Sync,
-    ToHost,
-    ToLinks,
-    WheelReport,
-)
+from fourbar_ros.hardware.messages import Command, Frame, FrameError, Heartbeat, LinkState
 
 LINKS = range(4)
 
@@ -94,61 +81,59 @@ class OdriveCodec:
                  torque_constants: Sequence[float] | None = None) -> None:
         if torque_constants is not None and not (len(torque_constants) == len(LINKS) and all(
                 isfinite(constant) and constant > 0.0 for constant in torque_constants)):
-            raise BusError('ODrives need four torque constants, positive and finite, got '
-                           f'{list(torque_constants)}: give motor_torque_constants in the '
-                           'mechanism file', name='motor_torque_constants',
-                           value=list(torque_constants), limit=0.0)
+            raise messages.BusError(
+                'ODrives need four torque constants, positive and finite, got '
+                f'{list(torque_constants)}: give motor_torque_constants in the mechanism file',
+                name='motor_torque_constants', value=list(torque_constants), limit=0.0)
         self._sensors = DbcCodec(sensors, _SENSOR_MESSAGES)
         file = DbcFile(name)
         self._axes = [
             _Axis(file, link, None if torque_constants is None else torque_constants[link])
             for link in LINKS]
-        self._from_links = {key: value for axis in self._axes
-                            for key, value in axis.from_link.items()}
-        self._from_host = {key: value for axis in self._axes
-                           for key, value in axis.from_host.items()}
+        self._from_links = dict(ChainMap(*(axis.from_link for axis in self._axes)))
+        self._from_host = dict(ChainMap(*(axis.from_host for axis in self._axes)))
         ids = self._from_links.keys() | self._from_host.keys()
         if shared := self._sensors.frame_ids & ids:
             raise DbcError(f'{file.path} and the sensor boards use the same identifier '
-                           f'0x{min(shared):03X}', file=str(file.path), value=min(shared))
+                           f'0x{min(shared):03X}', place=str(file.path), value=min(shared))
         self.frame_ids = self._sensors.frame_ids | ids
 
-    def to_links(self, message: ToLinks) -> Sequence[Frame]:
+    def to_links(self, message: messages.ToLinks) -> Sequence[Frame]:
         """
         Encode a message of the host.
 
         :raises FrameError: kind `value`: a number is not finite or does not fit.
         """
-        if isinstance(message, Sync):
+        if isinstance(message, messages.Sync):
             requests = [frame for axis in self._axes for frame in axis.requests]
             link = message.counter % _HEALTH_EVERY
             # Health is reported with a heartbeat, so it is useless before the first one.
             if link in LINKS and self._axes[link].heartbeat is not None:
                 requests += self._axes[link].health_requests
             return [*self._sensors.to_links(message), *requests]
-        if isinstance(message, Stop):
+        if isinstance(message, messages.Stop):
             return [axis.stop() for axis in self._axes]
-        if isinstance(message, Release):
+        if isinstance(message, messages.Release):
             return [axis.release() for axis in self._axes]
         axis = self._axis(message.link)
         return axis.command(message) if isinstance(message, Command) else axis.limit(message)
 
-    def to_host(self, message: ToHost) -> Sequence[Frame]:
+    def to_host(self, message: messages.ToHost) -> Sequence[Frame]:
         """
         Encode a message of a link, without what an ODrive does not report.
 
         :raises FrameError: kind `value`, as :meth:`to_links`.
         """
         axis = self._axis(message.link)
-        if isinstance(message, WheelReport):
+        if isinstance(message, messages.WheelReport):
             return axis.report_wheel(message)
-        if isinstance(message, MotorReport):
+        if isinstance(message, messages.MotorReport):
             return axis.report_motor(message)
         if isinstance(message, Heartbeat):
             return axis.report_health(message)
         return self._sensors.to_host(message)
 
-    def from_links(self, frame: Frame) -> ToHost | None:
+    def from_links(self, frame: Frame) -> messages.ToHost | None:
         """
         Decode at the host a message of a link.
 
@@ -159,10 +144,10 @@ class OdriveCodec:
         """
         if frame.frame_id not in self._from_links:
             return self._sensors.from_links(frame)
-        message: ToHost | None = _decode(frame, *self._from_links[frame.frame_id])
+        message: messages.ToHost | None = _decode(frame, *self._from_links[frame.frame_id])
         return message
 
-    def from_host(self, frame: Frame) -> ToLinks | None:
+    def from_host(self, frame: Frame) -> messages.ToLinks | None:
         """
         Decode at a link a message of the host; mode and axis state become a `Command`.
 
@@ -172,13 +157,11 @@ class OdriveCodec:
         """
         if frame.frame_id not in self._from_host:
             return self._sensors.from_host(frame)
-        message: ToLinks | None = _decode(frame, *self._from_host[frame.frame_id])
+        message: messages.ToLinks | None = _decode(frame, *self._from_host[frame.frame_id])
         return message
 
     def _axis(self, link: int) -> _Axis:
-        if link not in LINKS:
-            raise FrameError('value', f'link must be 0 to {len(LINKS) - 1}, got {link}',
-                             name='link', value=link, limit=(0, len(LINKS) - 1))
+        messages.check_link(link)
         return self._axes[link]
 
 
@@ -248,8 +231,9 @@ class _Axis:
             (self._torques, self._decode_motor), (self._bus, self._decode_voltage),
             (self._temperatures, self._decode_temperatures))
         self.from_host = by_identifier(
-            (self._estop, Stop), (self._clear, Release), (self._state, self._decode_state),
-            (self._mode, self._decode_mode), (self._input_speed, self._decode_speed),
+            (self._estop, messages.Stop), (self._clear, messages.Release),
+            (self._state, self._decode_state), (self._mode, self._decode_mode),
+            (self._input_speed, self._decode_speed),
             (self._input_torque, self._decode_torque), (self._limits, self._decode_limits))
         self.requests, self.health_requests = (
             [Frame(codec.frame_id, b'', True) for codec in codecs]
@@ -291,7 +275,7 @@ class _Axis:
         self._enabled, self._sent_by_speed = True, message.by_speed
         return frames
 
-    def limit(self, message: Limits) -> list[Frame]:
+    def limit(self, message: messages.Limits) -> list[Frame]:
         if self._torque_constant is None:
             return []
         self._limits_frame = self._limits.encode({
@@ -302,12 +286,12 @@ class _Axis:
 
     # The host decodes; arguments are signals of the file.
 
-    def _decode_wheel(self, Pos_Estimate: float, Vel_Estimate: float) -> WheelReport:
-        return WheelReport(self._link, None, Pos_Estimate * tau % TURN, TURN, None, 0,
-                           Vel_Estimate * tau)
+    def _decode_wheel(self, Pos_Estimate: float, Vel_Estimate: float) -> messages.WheelReport:
+        return messages.WheelReport(
+            self._link, None, Pos_Estimate * tau % TURN, TURN, None, 0, Vel_Estimate * tau)
 
-    def _decode_motor(self, Torque_Estimate: float, Torque_Target: None) -> MotorReport:
-        return MotorReport(self._link, Torque_Estimate)
+    def _decode_motor(self, Torque_Estimate: float, Torque_Target: None) -> messages.MotorReport:
+        return messages.MotorReport(self._link, Torque_Estimate)
 
     def _decode_voltage(self, Bus_Voltage: float) -> Heartbeat | None:
         self._voltage = Bus_Voltage
@@ -347,11 +331,11 @@ class _Axis:
 
     # The link encodes.
 
-    def report_wheel(self, message: WheelReport) -> list[Frame]:
+    def report_wheel(self, message: messages.WheelReport) -> list[Frame]:
         return [self._estimates.encode({
             'Pos_Estimate': message.angle / tau, 'Vel_Estimate': (message.speed or 0.0) / tau})]
 
-    def report_motor(self, message: MotorReport) -> list[Frame]:
+    def report_motor(self, message: messages.MotorReport) -> list[Frame]:
         return [self._torques.encode({
             'Torque_Target': message.torque, 'Torque_Estimate': message.torque})]
 
@@ -398,10 +382,12 @@ class _Axis:
         self._torque = Input_Torque
         return self._received_command()
 
-    def _decode_limits(self, Velocity_Limit: float, Current_Limit: float) -> Limits | None:
+    def _decode_limits(self, Velocity_Limit: float, Current_Limit: float
+                       ) -> messages.Limits | None:
         if self._torque_constant is None:
             return None
-        return Limits(self._link, Current_Limit * self._torque_constant, Velocity_Limit * tau)
+        return messages.Limits(
+            self._link, Current_Limit * self._torque_constant, Velocity_Limit * tau)
 
     def _received_command(self) -> Command:
         """Return the present input, mode and axis state as one command with its own sequence."""

@@ -38,15 +38,15 @@ import numpy as np
 
 LINKS = range(4)
 
+# Frames that are received in one call without waiting; the limit keeps a flooded bus from blocking
+# the host.
 MAX_FRAMES_PER_POLL = 2000
-"""Frames that are received in one call without waiting; the limit keeps a flooded bus from
-blocking the host."""
+# Counters whose sum per second is compared with the rule `bad_frames`.
 REJECTED_FRAMES = ('length', 'checksum', 'value', 'replayed', 'late', 'wrong_time', 'foreign')
-"""Counters whose sum per second is compared with the rule `bad_frames`."""
+# Minimum interval between two attempts to open the bus again [ns].
 REOPEN_NS = 1_000_000_000
-"""Minimum interval between two attempts to open the bus again [ns]."""
+# Number of repetitions of the last command when the host leaves; a frame may be lost.
 FINAL_COMMANDS = 3
-"""Number of repetitions of the last command when the host leaves; a frame may be lost."""
 NO_RATE = 'its angle samples have no rate and are ignored: without a gyro set gyro to false'
 
 

@@ -36,6 +36,7 @@ class Condition(NamedTuple):
 
 
 _WARN, _COAST = Reaction.WARN, Reaction.COAST
+# By name of the rule. Conditions under which a wheel may be out of control at least coast.
 CONDITIONS = {
     'wheel_silent': Condition(
         _COAST, 'no answer from the wheel for {value:.3g} s, limit {limit:g} s'),
@@ -57,7 +58,6 @@ CONDITIONS = {
     'wheel_speed_to_arm': Condition(
         _COAST, 'wheel speed {value:.3g} rad/s, limit for arming {limit:g} rad/s'),
 }
-"""By name of the rule. Conditions under which a wheel may be out of control at least coast."""
 
 
 @dataclass(frozen=True)

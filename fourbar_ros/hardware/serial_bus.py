@@ -24,10 +24,10 @@ _HEADER = Struct('<BIBI')
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 _LONG, _SHORT = (1 << 29) - 1, (1 << 11) - 1
 
+# Largest number of bytes per read.
 _CHUNK = 4096
-"""Largest number of bytes per read."""
+# Longest time of a write; then the line is not connected or too slow [s].
 _WRITE_TIMEOUT_S = 0.05
-"""Longest time of a write; then the line is not connected or too slow [s]."""
 
 
 class SerialBus(can.BusABC):

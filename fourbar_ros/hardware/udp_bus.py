@@ -28,8 +28,8 @@ _MAGIC, _VERSION = b'FB', 1
 _EXTENDED, _REMOTE, _ERROR = 1, 2, 4
 _LONGEST = _HEADER.size + 8
 
+# Size of the receive buffer of the kernel [bytes].
 _RECEIVE_BUFFER = 1 << 20
-"""Size of the receive buffer of the kernel [bytes]."""
 # Not in the socket module of every Python; its data are a timespec.
 _SO_TIMESTAMPNS = getattr(socket, 'SO_TIMESTAMPNS', 35)
 _TIMESPEC = Struct('@ll')
@@ -38,8 +38,8 @@ _ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size)
 # Errors that mean an absent peer.
 _UNREACHABLE = {errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.EHOSTDOWN}
 
+# Time for which a receive call without timeout discards foreign datagrams [s].
 _MAX_DISCARD_S = 0.001
-"""Time for which a receive call without timeout discards foreign datagrams [s]."""
 
 Address = tuple[str, int]
 

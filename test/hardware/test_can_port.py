@@ -199,13 +199,13 @@ def test_fault_of_the_bus_is_reported(stub):
     assert port.diagnostic_values()['bus_trouble'] == port.fault
 
 
-@pytest.mark.parametrize('state, told', [
+@pytest.mark.parametrize('state, expected', [
     (can.BusState.ACTIVE, None), (can.BusState.PASSIVE, 'error passive'),
     (can.BusState.ERROR, 'bus off')])
-def test_state_of_the_bus_is_told_where_python_can_does(stub, monkeypatch, state, told):
+def test_state_of_the_bus_is_reported(stub, monkeypatch, state, expected):
     monkeypatch.setattr(StubBus, 'state', state)
     fault = stub().fault
-    assert fault is None if told is None else fault.startswith(told)
+    assert fault is None if expected is None else fault.startswith(expected)
 
 
 @pytest.mark.parametrize('error, number, text', [
@@ -300,7 +300,7 @@ def line():
     line.close()
 
 
-def test_line_that_says_half_a_frame_holds_nobody_up_and_is_heard_out(line):
+def test_incomplete_frame_does_not_block_and_is_completed_later(line):
     said = b'\xaa' + bytes(4) + b'\x02' + b'\x23\x01\x00\x00' + b'ab\xbb'
     with open_port('serial', line.name) as port:
         for begin, end in ((0, 1), (1, 7), (7, 12)):

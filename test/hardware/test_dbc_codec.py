@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The prototype's language: what is written is read, and what is damaged is not taken."""
+"""The prototype's protocol: decoding inverts encoding, and corrupted frames are rejected."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -156,10 +156,10 @@ def test_clock(link, counter, time_us, boot):
 def test_heartbeat(link, sequence, state, faults, voltage, temperature, boot):
     report = Heartbeat(link, sequence, state, faults, voltage, temperature, boot)
     back = read(written(report))
-    for told, said, half_count in ((back.voltage, voltage, 0.005),
+    for decoded, encoded, half_count in ((back.voltage, voltage, 0.005),
                                    (back.temperature, temperature, 0.05)):
-        assert (told is None) == (said is None)
-        assert said is None or told == pytest.approx(said, abs=half_count + 1e-9)
+        assert (decoded is None) == (encoded is None)
+        assert encoded is None or decoded == pytest.approx(encoded, abs=half_count + 1e-9)
     assert replace(back, voltage=voltage, temperature=temperature) == report
 
 
@@ -169,7 +169,7 @@ def test_times_and_angles_of_any_size_are_reduced():
 
 
 @each_message
-def test_one_end_does_not_take_its_own_words_for_those_of_the_other(message):
+def test_an_end_does_not_decode_its_own_messages(message):
     frame = written(message)
     assert (CODEC.from_host(frame) is None) == (message in OF_LINKS)
     assert (CODEC.from_links(frame) is None) == (message in OF_HOST)
@@ -205,7 +205,7 @@ def test_wrong_length(message):
         assert caught.value.values['value'] == length
 
 
-def test_foreign_frames_are_nobodys():
+def test_foreign_frames_are_ignored():
     for frame_id in set(range(0x800)) - CODEC.frame_ids:
         assert read(Frame(frame_id, bytes(8))) is None
     assert all(read(Frame(frame_id, b'', True)) is None for frame_id in CODEC.frame_ids)
@@ -231,7 +231,7 @@ def test_foreign_frames_are_nobodys():
     replace(HEARTBEAT, faults=frozenset({'tired'})), replace(HEARTBEAT, boot=None),
     replace(HEARTBEAT, sequence=None), replace(MOTOR, link=4), replace(COMMAND, link=-1),
 ], ids=named)
-def test_what_does_not_fit_is_not_written(message):
+def test_invalid_value_is_not_encoded(message):
     with pytest.raises(FrameError) as caught:
         written(message)
     assert caught.value.kind == 'value' and 'limit' in caught.value.values
@@ -245,7 +245,7 @@ def test_what_does_not_fit_is_not_written(message):
     (MOTOR, 'STATE', 5), (HEARTBEAT, 'STATE', 15), (HEARTBEAT, 'FAULTS', 0x800),
     (Stop(), 'CODE', 0x3C), (Release(), 'CODE', 0),
 ], ids=named)
-def test_invalid_count_is_not_read(message, signal, count):
+def test_invalid_count_is_not_decoded(message, signal, count):
     """Though its checksum is right."""
     frame = written(message)
     layout = DATABASE.get_message_by_frame_id(frame.frame_id)
@@ -257,7 +257,7 @@ def test_invalid_count_is_not_read(message, signal, count):
     assert caught.value.values['name'] == f'{layout.name}.{signal}'
 
 
-def test_half_a_turn_is_told_to_one_side():
+def test_half_a_turn_is_decoded_as_plus_pi():
     for angle in (pi, -pi):
         assert read(written(replace(ANGLE, angle=angle))).angle == pi
 
@@ -296,7 +296,7 @@ def test_identifiers_places_and_scales_are_those_of_the_file(changed):
     assert codec.from_links(written(ANGLE)) is None
 
 
-def test_signals_of_the_lab_are_no_trouble(changed):
+def test_further_signals_are_ignored(changed):
     codec = changed(
         (r'^( SG_ ANSWERED : .*)$', r'\1\n SG_ CURRENT : 45|3@1+ (1,0) [0|0] "A" HOST'))
     assert codec.from_links(*codec.to_host(MOTOR)).state is MOTOR.state
@@ -330,10 +330,10 @@ def test_signals_of_the_lab_are_no_trouble(changed):
     (r'^ SG_ MODE : 32\|1', ' SG_ MODE : 31|1', {}),
     (r'^ SG_ CHECKSUM : 56\|8', ' SG_ CHECKSUM : 56|9', {}), (r'^BU_:', 'BU_ ', {}),
 ])
-def test_file_that_lacks_something_is_refused_in_one_line(
+def test_incomplete_file_is_refused_in_one_line(
         changed, pattern, replacement, values, refuses, tmp_path):
     path = str(tmp_path / 'lab.dbc')
-    with refuses(DbcError, file=path, **values) as caught:
+    with refuses(DbcError, place=path, **values) as caught:
         changed((pattern, replacement))
     assert path in str(caught.value)
 
@@ -341,10 +341,10 @@ def test_file_that_lacks_something_is_refused_in_one_line(
 @pytest.mark.parametrize('content', [
     b'', b'nonsense', b'\xff\xfe\x00', b'BO_ 1 A: 8 X\n SG_ S : 0|8@1+ (1,0', b'BO_ x y',
     b'VERSION ""\n', b'mechanism: {}\n'])
-def test_what_is_no_dbc_file_is_refused_in_one_line(tmp_path, content, refuses):
+def test_invalid_dbc_file_is_refused_in_one_line(tmp_path, content, refuses):
     path = tmp_path / 'bad.dbc'
     path.write_bytes(content)
-    with refuses(DbcError, file=str(path)):
+    with refuses(DbcError, place=str(path)):
         DbcCodec(str(path))
 
 

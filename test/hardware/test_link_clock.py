@@ -108,7 +108,7 @@ def test_slow_answer_and_one_from_before_the_question_say_nothing() -> None:
 
 @pytest.mark.parametrize('wrap_us', [2 ** 20, 10 * 2 ** 20, 2 ** 32])
 @pytest.mark.parametrize('away_s', [-0.4, -0.001, 0.0, 0.4])
-def test_times_that_start_over_are_told_apart(wrap_us: int, away_s: float) -> None:
+def test_wrapped_times_are_unwrapped(wrap_us: int, away_s: float) -> None:
     clock, rng = LinkClock(), np.random.default_rng(0)
     now_ns = exchanges(clock, rng, 2000, 3e-5, 1e-5, offset_s=4000.0)
     then_ns = now_ns + round(away_s * 1e9)

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""ODrives and sensor boards: both ends understand one another, as far as an ODrive has words."""
+"""ODrives and sensor boards: both ends decode each other, within CANSimple."""
 
 from dataclasses import replace
 from math import inf, nan, pi
@@ -49,8 +49,8 @@ def make(**options):
 HOST, LINK = make(), make()
 
 
-def told(host, link, message):
-    """Let the host say something; return what the link understands, frame by frame."""
+def received(host, link, message):
+    """Return what the link decodes of a message of the host, frame by frame."""
     return [link.from_host(frame) for frame in host.to_links(message)]
 
 
@@ -87,28 +87,28 @@ def test_motor(link, torque):
 @repeatable
 @given(links, st.floats(0.0, 10.0), st.floats(0.0, 1e4))
 def test_limits(link, torque, speed):
-    limits, = told(HOST, LINK, Limits(link, torque, speed))
+    limits, = received(HOST, LINK, Limits(link, torque, speed))
     assert limits == Limits(link, pytest.approx(torque, rel=2 * SINGLE, abs=1e-40),
                             pytest.approx(speed, rel=2 * SINGLE, abs=1e-40))
 
 
 @repeatable
 @given(links, st.floats(-10.0, 10.0), st.booleans(), st.booleans())
-def test_command_to_whatever_was_told_before(link, value, by_speed, enable):
+def test_command_after_any_other(link, value, by_speed, enable):
     """The last word of the frames is the command, whichever were sent before."""
-    command = told(HOST, LINK, Command(link, value, by_speed, enable, 0))[-1]
+    command = received(HOST, LINK, Command(link, value, by_speed, enable, 0))[-1]
     assert (command.link, command.enable) == (link, enable)
     if enable:
         assert command.by_speed == by_speed
         assert command.value == pytest.approx(value, rel=2 * SINGLE, abs=1e-40)
 
 
-def test_link_numbers_commands_as_they_come():
+def test_link_numbers_received_commands():
     host, link = make(), make()
-    heard = [command for _ in range(200)
-             for command in told(host, link, Command(1, 0.01, False, True, 9))]
+    commands = [command for _ in range(200)
+             for command in received(host, link, Command(1, 0.01, False, True, 9))]
     assert all((after.sequence - before.sequence) % 256 == 1
-               for before, after in zip(heard, heard[1:]))
+               for before, after in zip(commands, commands[1:]))
 
 
 def sent(host, message):
@@ -125,11 +125,11 @@ def test_mode_and_state_are_sent_where_they_change():
     assert sent(host, torque) == [by_torque]
     assert sent(host, speed) == [by_speed, mode, by_speed]
     assert sent(host, speed) == [by_speed]
-    # Another link was told nothing yet.
+    # The other link has received nothing yet.
     assert len(sent(host, replace(torque, link=3))) == 4
 
 
-def test_no_power_is_said_every_time_and_power_only_once():
+def test_power_off_is_repeated_and_power_on_is_not():
     host = make()
     enabled, disabled = (Command(0, 0.0, False, enable, 0) for enable in (True, False))
     assert [sent(host, disabled) for _ in range(3)] == [[(0, 0x07)]] * 3
@@ -139,11 +139,11 @@ def test_no_power_is_said_every_time_and_power_only_once():
 
 
 @pytest.mark.parametrize('message', [Stop(), Release()])
-def test_after_a_stop_everything_is_said_again(message):
+def test_after_a_stop_everything_is_sent_again(message):
     host, link = make(), make()
     command = Command(1, 0.01, False, True, 0)
     host.to_links(command)
-    assert told(host, link, message) == [message] * 4
+    assert received(host, link, message) == [message] * 4
     assert len(host.to_links(command)) == 4
 
 
@@ -155,8 +155,8 @@ def test_link_with_power_never_has_an_old_value():
             (90.0, True, True), (0.5, True, False), (1.0, True, True), (0.25, False, True),
             (2.0, True, True), (0.0, False, False), (0.125, False, True)):
         present = (by_speed, pytest.approx(value, rel=1e-6))
-        for heard in told(host, link, Command(0, value, by_speed, enable, 0)):
-            assert not heard.enable or (heard.by_speed, heard.value) in (last, present)
+        for commands in received(host, link, Command(0, value, by_speed, enable, 0)):
+            assert not commands.enable or (commands.by_speed, commands.value) in (last, present)
         last = present if enable else None
 
 
@@ -177,7 +177,7 @@ def test_frames_are_those_of_the_manual():
     assert host.to_links(Release()) == [Frame(identifier(node, 0x18), b'\0') for node in range(4)]
 
 
-def test_sync_asks_everybody():
+def test_sync_requests_every_answer():
     """The sensor boards by `SYNC`, every ODrive for wheel and motor, and one now and again."""
     host, link = make(), make()
     assert max(len(host.to_links(Sync(counter))) for counter in range(16)) == 9
@@ -233,12 +233,12 @@ def test_health_goes_through(link, state, faults, voltage, temperature):
                                pytest.approx(temperature, rel=SINGLE, abs=1e-40))
 
 
-def test_fault_without_a_name_is_still_one():
+def test_fault_without_a_bit_is_still_a_fault():
     frame, = OdriveCodec().to_host(Heartbeat(0, 0, LinkState.FAULT, frozenset({'angle_sensor'})))
     assert OdriveCodec().from_links(frame).state is LinkState.FAULT
 
 
-def test_voltage_and_temperature_are_told_with_the_last_heartbeat():
+def test_voltage_and_temperature_complete_the_last_heartbeat():
     host = OdriveCodec()
     bus = Frame(identifier(1, 0x17), struct.pack('<ff', 24.0, 1.0))
     hot = Frame(identifier(1, 0x15), struct.pack('<ff', 40.0, 60.0))
@@ -265,16 +265,16 @@ def test_limits_are_missing_until_they_were_sent():
 
 
 def test_limits_are_sent_again_before_power():
-    """An ODrive may have started anew without anybody having heard it say so."""
+    """An ODrive may have restarted unnoticed."""
     host, link = make(), make()
     limits = host.to_links(Limits(1, 0.05, 300.0))
     enabled, disabled = (Command(1, 0.01, False, enable, 0) for enable in (True, False))
     assert host.to_links(enabled)[:1] == limits
     assert limits[0] not in host.to_links(enabled)
     host.to_links(disabled)
-    heard = told(host, link, enabled)
-    assert isinstance(heard[0], Limits)
-    assert [message.enable for message in heard[1:]] == [False, False, True, True]
+    commands = received(host, link, enabled)
+    assert isinstance(commands[0], Limits)
+    assert [message.enable for message in commands[1:]] == [False, False, True, True]
     assert len(host.to_links(replace(disabled, enable=True, link=2))) == 4
 
 
@@ -294,7 +294,7 @@ def test_impossible_torque_constants(constants):
 
 @pytest.mark.parametrize('message', [
     AngleReport(3, 5, 3.0, None, 500, 10 * 2 ** 20), ClockReport(2, 9, 2 ** 32 - 1, 4)])
-def test_sensor_boards_speak_the_prototypes_language(message):
+def test_sensor_boards_use_the_messages_of_the_prototype(message):
     frames, = zip(LINK.to_host(message), DbcCodec('prototype').to_host(message))
     assert frames[0] == frames[1]
     back = HOST.from_links(frames[0])
@@ -325,7 +325,7 @@ def test_sensor_boards_that_use_an_identifier_of_an_odrive_are_refused(
     path = tmp_path / 'lab.dbc'
     path.write_text(text.replace(' 304 ', ' 9 '))
     odrive = str(share_directory() / 'config' / 'odrive.dbc')
-    with refuses(DbcError, file=odrive, value=0x009):
+    with refuses(DbcError, place=odrive, value=0x009):
         OdriveCodec(str(path))
 
 
@@ -337,11 +337,11 @@ def test_file_that_lacks_something_is_refused(tmp_path, old, new, message, signa
     text = (share_directory() / 'config' / 'odrive.dbc').read_text()
     path = tmp_path / 'lab.dbc'
     path.write_text(text.replace(old, new))
-    with refuses(DbcError, file=str(path), message=message, signal=signal):
+    with refuses(DbcError, place=str(path), message=message, signal=signal):
         OdriveCodec(name=str(path))
 
 
-def test_foreign_frames_are_nobodys():
+def test_foreign_frames_are_ignored():
     for frame_id in set(range(0x800)) - HOST.frame_ids:
         frame = Frame(frame_id, bytes(8))
         assert HOST.from_links(frame) is None and LINK.from_host(frame) is None
@@ -366,7 +366,7 @@ def test_wrong_length(frame_id):
     *(Limits(0, *values) for values in ((nan, 1.0), (1.0, nan), (-1.0, 1.0), (1.0, -1.0),
                                         (inf, 1.0))),
     Sync(256), Limits(4, 1.0, 1.0), Command(-1, 0.0, True, True, 0)], ids=str)
-def test_what_does_not_fit_is_not_written_by_the_host(message):
+def test_invalid_value_is_not_encoded_by_the_host(message):
     with pytest.raises(FrameError) as caught:
         HOST.to_links(message)
     assert caught.value.kind == 'value'
@@ -378,7 +378,7 @@ def test_what_does_not_fit_is_not_written_by_the_host(message):
     Heartbeat(0, 0, LinkState.IDLE, frozenset(), nan),
     Heartbeat(0, 0, LinkState.IDLE, frozenset(), 12.0, inf), MotorReport(4, 0.0)],
     ids=str)
-def test_what_does_not_fit_is_not_written_by_a_link(message):
+def test_invalid_value_is_not_encoded_by_a_link(message):
     with pytest.raises(FrameError) as caught:
         LINK.to_host(message)
     assert caught.value.kind == 'value'
@@ -388,7 +388,7 @@ def test_what_does_not_fit_is_not_written_by_a_link(message):
     (0x09, struct.pack('<ff', nan, 0.0)), (0x09, struct.pack('<ff', 0.0, inf)),
     (0x1C, struct.pack('<ff', 0.0, nan)), (0x17, struct.pack('<ff', nan, 0.0)),
     (0x15, struct.pack('<ff', inf, 0.0))])
-def test_what_cannot_be_is_not_read_from_a_link(command, data):
+def test_invalid_value_is_not_decoded_from_a_link(command, data):
     with pytest.raises(FrameError) as caught:
         HOST.from_links(Frame(identifier(3, command), data))
     assert caught.value.kind == 'value'
@@ -399,7 +399,7 @@ def test_what_cannot_be_is_not_read_from_a_link(command, data):
     (0x0B, struct.pack('<II', 1, 2)), (0x0D, struct.pack('<ff', nan, 0.0)),
     (0x0E, struct.pack('<ff', inf, 0.0)), (0x0F, struct.pack('<ff', -1.0, 1.0)),
     (0x0F, struct.pack('<ff', 1.0, nan))])
-def test_what_cannot_be_is_not_read_from_the_host(command, data):
+def test_invalid_value_is_not_decoded_from_the_host(command, data):
     with pytest.raises(FrameError) as caught:
         LINK.from_host(Frame(identifier(3, command), data))
     assert caught.value.kind == 'value'

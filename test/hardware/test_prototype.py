@@ -39,14 +39,14 @@ def test_stamps_are_times_of_measurement(world) -> None:
             assert 4_000_000 < age_ns < 15_000_000
 
 
-def test_clocks_are_found(world) -> None:
+def test_clocks_are_estimated(world) -> None:
     world.run(20.0)
     for link, drift in zip(world.prototype.links, (80e-6, -40e-6, 10e-6, -60e-6)):
         assert link.clock.drift == pytest.approx(drift, abs=5e-6)
         assert link.clock.jitter < 1e-4
 
 
-def test_torque_reaches_the_wheels_and_is_told(world) -> None:
+def test_torque_reaches_the_wheels_and_is_reported(world) -> None:
     world.torque(0.01, 0.01, 0.01, 0.01)
     assert world.arm() == (True, 'armed')
     world.run(0.5)

@@ -14,7 +14,7 @@ TORQUE = (0.01, -0.01, 0.02, -0.02)
 
 @pytest.fixture
 def world(make_world):
-    """Return a settled world that speaks CANSimple."""
+    """Return a settled world with CANSimple on its bus."""
     codec = OdriveCodec(torque_constants=load_mechanism('prototype').motor_torque_constants)
     world = make_world(codec)
     world.run(1.0)
@@ -50,13 +50,13 @@ def test_speeds_are_followed(world) -> None:
         world.wire.emulators[0].samples.truth.wheel_speeds, [20.0, -10.0, 5.0, 0.0], atol=0.2)
 
 
-@pytest.mark.parametrize(('trouble', 'state'), [
+@pytest.mark.parametrize(('kind', 'state'), [
     ('silent', DeviceState.DISARMED), ('low_battery', DeviceState.DISARMED)])
-def test_what_stops_it_does_so_as_before(world, trouble, state) -> None:
+def test_safety_rules_apply_with_odrives(world, kind, state) -> None:
     world.torque(*TORQUE)
     assert world.arm()[0]
     world.run(0.2)
-    world.wire.emulators[0].inject_fault('link_d', trouble)
+    world.wire.emulators[0].inject_fault('link_d', kind)
     world.run(1.0)
     assert world.testbed.arming.state is state or not world.testbed.arming.armed
     assert world.testbed.arming.reason.startswith('link_d: ')

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What stops the prototype: limits, links that fail, a bus that goes away, frames that lie."""
+"""What stops the prototype: safety rules, link faults, bus faults, bad frames."""
 
 from math import inf, nan
 from pathlib import Path
@@ -70,7 +70,7 @@ def test_link_fault_stops_the_wheels(driven, kind, state, within, rule, numbers)
     assert driven.testbed.arming.reason.startswith(f'link_c: {rule}: ')
     assert all(number in driven.testbed.arming.reason for number in numbers)
     if kind == 'reboot':
-        # In one order or the other: it also does not drive when told to.
+        # The rule `not_armed` applies too, before or after.
         assert_coasting(driven)
         return
     assert_coasting(driven)
@@ -133,7 +133,7 @@ def test_link_that_stays_silent_is_disarmed_first_and_then_an_emergency_stop(dri
     assert driven.arm() == (True, 'armed')
 
 
-def test_link_that_falls_silent_while_nobody_drives_stops_nothing(driven) -> None:
+def test_silent_link_has_no_effect_while_disarmed(driven) -> None:
     driven.testbed.disarm('test')
     driven.run(0.1)
     driven.wire.emulators[0].inject_fault('link_b', 'silent')
@@ -141,18 +141,18 @@ def test_link_that_falls_silent_while_nobody_drives_stops_nothing(driven) -> Non
     assert driven.testbed.arming.state is DeviceState.DISARMED
 
 
-def test_link_that_is_heard_again_at_once_is_only_disarmed(driven) -> None:
+def test_link_that_returns_at_once_is_only_disarmed(driven) -> None:
     driven.wire.emulators[0].inject_fault('link_b', 'silent')
     wait(driven, lambda: not driven.testbed.arming.armed, 0.07)
     driven.wire.emulators[0].inject_fault('link_b', '')
     driven.run(1.0)
-    # What comes later is of another time.
+    # A later fault does not continue the first one.
     driven.wire.emulators[0].inject_fault('link_b', 'silent')
     driven.run(1.0)
     assert driven.testbed.arming.state is DeviceState.DISARMED
 
 
-def test_diagnosis_tells_all_of_a_link_the_worst_first(driven) -> None:
+def test_diagnostics_list_the_faults_of_a_link_by_severity(driven) -> None:
     driven.wire.emulators[0].inject_fault('link_c', 'hot')
     driven.run(1.5)
     assert driven.prototype.diagnostics() == {
@@ -161,7 +161,7 @@ def test_diagnosis_tells_all_of_a_link_the_worst_first(driven) -> None:
 
 
 @pytest.mark.parametrize('seconds', [1.0, 10.0])
-def test_bus_that_drops_out_leaves_wheels_coasting_until_somebody_arms(driven, seconds) -> None:
+def test_after_a_bus_failure_wheels_coast_until_armed(driven, seconds) -> None:
     emulator = driven.wire.emulators[0]
     emulator.inject_fault('bus', 'off')
     begin_ns = driven.wire.now_ns
@@ -219,7 +219,7 @@ def test_missing_gyros_are_reported(make_world) -> None:
 
 
 def test_bus_that_is_gone_during_a_stop_is_not_opened_at_every_tick(driven) -> None:
-    """To open one may take seconds, in which nobody would be heard."""
+    """Opening a bus may take seconds, in which nothing is received."""
     driven.testbed.emergency_stop('test')
     driven.wire.broken = True
     driven.wire.opened_ns.clear()
@@ -248,7 +248,7 @@ def test_emergency_stop_latches_in_the_links_too(driven) -> None:
     assert [firmware(driven, link).state for link in range(4)] == [LinkState.IDLE] * 4
 
 
-def test_link_that_starts_anew_during_a_stop_is_stopped(driven) -> None:
+def test_link_that_restarts_during_a_stop_is_stopped(driven) -> None:
     driven.testbed.emergency_stop('test')
     driven.run(0.05)
     driven.wire.emulators[0].inject_fault('link_b', 'reboot')
@@ -256,7 +256,7 @@ def test_link_that_starts_anew_during_a_stop_is_stopped(driven) -> None:
     assert firmware(driven, 1).state is LinkState.STOPPED
 
 
-def test_leaving_ends_all_torque(driven) -> None:
+def test_close_ends_all_torque(driven) -> None:
     driven.wire.sent_frames.clear()
     driven.testbed.close()
     last = [driven.codec.from_host(frame) for frame in driven.wire.sent_frames][-4:]
@@ -268,7 +268,7 @@ def test_leaving_ends_all_torque(driven) -> None:
     assert [firmware(driven, link).state for link in range(4)] == [LinkState.IDLE] * 4
 
 
-def test_two_links_with_one_id_are_told_and_stop_everything(driven) -> None:
+def test_two_links_with_one_identifier_stop_all(driven) -> None:
     driven.wire.emulators.append(driven.emulator((1,), 'prototype', seed=7))
     wait(driven, lambda: driven.testbed.arming.state is DeviceState.EMERGENCY_STOP, 1.0)
     assert driven.testbed.arming.reason.startswith('link_b: ')
@@ -313,7 +313,7 @@ def test_bad_frames_are_ignored_and_counted(driven, kind) -> None:
     assert driven.samples[-1].wheels.efforts == pytest.approx(TORQUE, rel=1e-3)
 
 
-def test_heartbeats_of_the_past_keep_no_link_alive(driven) -> None:
+def test_repeated_heartbeats_are_rejected(driven) -> None:
     beats = [driven.codec.to_host(Heartbeat(
         1, sequence, LinkState.ARMED, frozenset(), 12.0, 30.0,
         driven.prototype.links[1].heartbeat.boot))[0]
@@ -353,7 +353,7 @@ def test_old_command_does_not_move_a_wheel(driven) -> None:
     assert firmware(driven, 0).counts['replayed'] >= 1
 
 
-def test_host_that_counts_anew_is_heard_after_a_silence_and_drives_nothing_by_that(world) -> None:
+def test_host_with_a_new_count_is_accepted_after_a_timeout_without_power(world) -> None:
     """As after an outage in which more commands were lost than the count goes."""
     link, now_ns = firmware(world, 0), world.wire.now_ns
     limit_ns = 110_000_000
@@ -392,7 +392,7 @@ def test_motor_that_gives_torque_without_power_stops_everything(world) -> None:
     assert 'link_c: unasked_torque: ' in world.testbed.arming.reason
 
 
-def test_stop_frame_of_anybody_stops_the_links(driven) -> None:
+def test_stop_of_another_host_stops_the_links(driven) -> None:
     stop, = driven.codec.to_links(Stop())
     driven.wire.emulators[0].receive(stop, driven.wire.now_ns)
     wait(driven, lambda: not driven.testbed.arming.armed, 0.2)
@@ -401,7 +401,7 @@ def test_stop_frame_of_anybody_stops_the_links(driven) -> None:
     assert_coasting(driven)
 
 
-def test_links_that_somebody_else_stopped_are_released_by_a_reset(world) -> None:
+def test_links_stopped_by_another_host_are_released_by_a_reset(world) -> None:
     """As by a host before this one, or where the release was lost."""
     world.wire.send(world.codec.to_links(Stop())[0])
     world.run(0.1)

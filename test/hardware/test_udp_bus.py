@@ -62,21 +62,21 @@ def test_python_can_finds_it(make):
 def test_frames_arrive_as_they_were_sent(pair, seed):
     first, second = pair
     rng = np.random.default_rng(seed)
-    for sender, hearer in (pair, pair[::-1]) * 20:
+    for sender, receiver in (pair, pair[::-1]) * 20:
         extended, remote = bool(rng.integers(2)), bool(rng.integers(2))
         sent = can.Message(
             arbitration_id=int(rng.integers(1 << (29 if extended else 11))),
             is_extended_id=extended, is_remote_frame=remote,
             dlc=8 if remote else None, data=None if remote else rng.bytes(rng.integers(9)))
         sender.send(sent)
-        heard = hearer.recv(PATIENCE_S)
-        assert heard.equals(sent, timestamp_delta=None, check_direction=False), f'seed {seed}'
+        received = receiver.recv(PATIENCE_S)
+        assert received.equals(sent, timestamp_delta=None, check_direction=False), f'seed {seed}'
 
 
 def test_error_frames_are_carried(pair):
     pair[0].send(can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8)))
-    heard = pair[1].recv(PATIENCE_S)
-    assert heard.is_error_frame and heard.arbitration_id == 0x40
+    received = pair[1].recv(PATIENCE_S)
+    assert received.is_error_frame and received.arbitration_id == 0x40
 
 
 def test_datagram_is_laid_out_as_documented(make, plain):
@@ -94,33 +94,33 @@ def test_stamps_are_of_arrival_and_never_go_back(pair):
         first.send(can.Message(arbitration_id=number, is_extended_id=False))
     sent = time()
     # Nobody reads before all of them have come.
-    heard = [second.recv(PATIENCE_S) for _ in range(200)]
-    assert [message.arbitration_id for message in heard] == list(range(200))
-    stamps = [message.timestamp for message in heard]
+    received = [second.recv(PATIENCE_S) for _ in range(200)]
+    assert [message.arbitration_id for message in received] == list(range(200))
+    stamps = [message.timestamp for message in received]
     assert stamps == sorted(stamps)
     # A float of system time is good for less than a microsecond.
     assert before - 1e-6 <= stamps[0] and stamps[-1] <= sent + 1e-6
 
 
-def test_every_peer_hears_every_frame(make):
+def test_every_peer_receives_every_frame(make):
     sender = make()
-    hearers = [make(address(sender)) for _ in range(3)]
-    for hearer in hearers:
-        sender.add_peer(address(hearer))
+    receivers = [make(address(sender)) for _ in range(3)]
+    for receiver in receivers:
+        sender.add_peer(address(receiver))
     sender.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-    assert [hearer.recv(PATIENCE_S).arbitration_id for hearer in hearers] == [0x80] * 3
+    assert [receiver.recv(PATIENCE_S).arbitration_id for receiver in receivers] == [0x80] * 3
 
 
 def test_peers_are_named_in_one_string(make):
-    hearers = [make(), make()]
-    sender = make(', '.join(map(address, hearers)))
-    for hearer in hearers:
-        hearer.add_peer(address(sender))
+    receivers = [make(), make()]
+    sender = make(', '.join(map(address, receivers)))
+    for receiver in receivers:
+        receiver.add_peer(address(sender))
     sender.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-    assert all(hearer.recv(PATIENCE_S) for hearer in hearers)
+    assert all(receiver.recv(PATIENCE_S) for receiver in receivers)
 
 
-def test_who_is_no_peer_is_not_heard_but_counted(pair, plain):
+def test_foreign_datagrams_are_ignored_and_counted(pair, plain):
     first, second = pair
     for _ in range(3):
         plain.sendto(b'FB\x01\x00\x00\x00\x01\x23\x00', second.address)
@@ -142,7 +142,7 @@ MALFORMED = [
 
 
 @pytest.mark.parametrize('datagram', MALFORMED, ids=bytes.hex)
-def test_what_is_no_frame_is_not_heard_but_counted(make, plain, datagram):
+def test_malformed_datagrams_are_ignored_and_counted(make, plain, datagram):
     bus = make('127.0.0.1:{}'.format(plain.getsockname()[1]))
     plain.sendto(datagram, bus.address)
     plain.sendto(b'FB\x01\x00\x00\x00\x01\x23\x00', bus.address)
@@ -158,7 +158,7 @@ def test_a_look_costs_no_time_and_a_wait_ends(pair):
     assert 0.05 <= monotonic() - began < PATIENCE_S
 
 
-def test_nobody_there_yet_is_no_error(make, plain):
+def test_absent_peer_is_no_error(make, plain):
     nobody = plain.getsockname()[1]
     plain.close()
     bus = make(f'127.0.0.1:{nobody}')
