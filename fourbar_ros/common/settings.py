@@ -17,7 +17,7 @@ import in microseconds, which matters for every command.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, MISSING
 from math import inf, isfinite
 import re
@@ -130,6 +130,30 @@ class Setting:
                     limit=self.limits or (-inf, inf))
         return value
 
+    def check_each(self, values: Any, elements: Sequence[str], name: str = '',
+                   inner: Sequence[str] = ()) -> list[Any]:
+        """
+        Return the values of a list or array, each in the type of the setting.
+
+        :param elements: name of each element; messages call it `name.element`.
+        :param name: as of `check`.
+        :param inner: where the elements are lists themselves, the names of their elements.
+        :raises SettingError: no list, of another length (`limit` is the right one), or an element
+            is refused.
+        """
+        name = name or self.name
+        if isinstance(values, (str, bytes, Mapping)) or not isinstance(values, Iterable):
+            raise SettingError(f'{name} must be a list of {len(elements)}, got {_quoted(values)}',
+                               name=name, value=values, limit=list)
+        listed = list(values)
+        if len(listed) != len(elements):
+            raise SettingError(
+                f'{name} must hold {len(elements)} values ({", ".join(elements)}), got '
+                f'{len(listed)}', name=name, value=len(listed), limit=len(elements))
+        return [self.check_each(value, inner, f'{name}.{element}') if inner
+                else self.check(value, f'{name}.{element}')
+                for value, element in zip(listed, elements)]
+
 
 _KINDS = {float: 'a number', int: 'a whole number', bool: 'true or false', str: 'text'}
 
@@ -198,7 +222,7 @@ def _rows(kind: type[Any], prefix: str) -> Iterator[Setting]:
         declared = item.metadata.get('setting')
         if declared is not None:
             attributes = {**vars(declared), 'name': prefix + item.name}
-            if declared.default is MISSING:
+            if declared.kind is type(MISSING):
                 # The annotation is text where a module postpones its evaluation.
                 attributes['kind'] = _TYPES.get(str(item.type), item.type)
             yield Setting(**attributes)

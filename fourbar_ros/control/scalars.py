@@ -11,7 +11,7 @@ from fourbar_ros.control.computed_torque import A00, A01, A11, CONDITION
 from fourbar_ros.control.controller import Controller
 from fourbar_ros.control.null_space import null_torques
 from fourbar_ros.mechanism.constants import Array
-from fourbar_ros.mechanism.dynamics import angular_momentum
+from fourbar_ros.mechanism.momentum import angular_momentum
 import numpy as np
 
 LINKS = tuple('abcd')

@@ -44,11 +44,12 @@ from fourbar_ros.mechanism.constrained import (
     constrained_accelerations,
     directions,
     factored_inertia,
+    LinkMotion,
     orthogonal_columns,
     project_onto_closure,
     signed_links,
 )
-from fourbar_ros.mechanism.forces import NOTHING
+from fourbar_ros.mechanism.forces import NOTHING, System
 import numpy as np
 
 # Upper bound of the natural frequency along the weak direction at RIGID_CONSTRAINT_RATIO [rad/s]:
@@ -172,8 +173,9 @@ def _accelerations(angles: Vector4, rates: Vector4, torques: Array, model: Model
     force = weak.stiffness * weak.gap + model.damping * dot(weak.gradient, rates)
     for i in range(4):
         drive[i] = torques[i] + force * weak.gradient[i]
-    accelerations, _, _ = constrained_accelerations(
-        angles[0], cosines, sines, rates, (0.0, 0.0), drive, model.constants, NOTHING, False)
+    accelerations = constrained_accelerations(
+        LinkMotion(angles[0], cosines, sines, rates, (0.0, 0.0)), drive,
+        System(model.constants, NOTHING), False).accelerations
     mean = 0.25 * total(rates)
     w = (rates[0] - mean, rates[1] - mean, rates[2] - mean, rates[3] - mean)
     opening = dot(weak.gradient, accelerations) + dot(weak.curvature, multiply(w, w))

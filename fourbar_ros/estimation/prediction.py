@@ -43,6 +43,7 @@ from fourbar_ros.estimation.filter_state import (
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.kernels.linear_algebra import combine, dot, solve_lower, solve_upper
 from fourbar_ros.kernels.matrices import product
+from fourbar_ros.kernels.runge_kutta import Drive
 from fourbar_ros.mechanism.change_points import (
     DISTINCT_SIGMAS_SQUARED,
     REDUCED_FORM_LIMIT,
@@ -55,7 +56,7 @@ from fourbar_ros.mechanism.constrained import (
     project_onto_closure,
 )
 from fourbar_ros.mechanism.dynamics import gamma_matrix, mass_matrix
-from fourbar_ros.mechanism.forces import NOTHING
+from fourbar_ros.mechanism.forces import NOTHING, System
 from fourbar_ros.mechanism.integration import advance_state
 from fourbar_ros.mechanism.reduced import close_reduced
 from fourbar_ros.mechanism.state import STATE_SIZE
@@ -307,9 +308,10 @@ def _integrate(x: Array, wheel_torques: Array, duration: float, weak_held: bool,
     drive[0] -= disturbances[0]
     drive[1] -= disturbances[1]
     if weak_held:
-        advance_state(end, drive, drive, drive, duration, constants, NOTHING)
+        advance_state(end, Drive(drive, drive, drive), duration, System(constants, NOTHING))
     else:
-        advance_constrained(end, drive, drive, drive, duration, constants, NOTHING, False)
+        advance_constrained(
+            end, Drive(drive, drive, drive), duration, System(constants, NOTHING), False)
 
 
 @kernel

@@ -38,6 +38,9 @@ UNUSED_AFTER = 30 * 24 * 3600.0
 prange = numba.prange
 """The parallel range of a kernel compiled with `parallel=True`."""
 
+FUSED = {'contract'}
+"""Value of the option `fastmath` with which a product and a sum may be rounded once."""
+
 _OPTIONS = {'error_model': 'numpy', 'fastmath': False}
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 

@@ -15,12 +15,7 @@ from fourbar_ros.mechanism.closure import (
     ClosureError,
     nearest_assembly,
 )
-from fourbar_ros.mechanism.dynamics import (
-    angular_momentum,
-    kinetic_energy,
-    reduced_form,
-    ReducedForm,
-)
+from fourbar_ros.mechanism.dynamics import reduced_form, ReducedForm
 from fourbar_ros.mechanism.geometry import com_positions_in_table, joint_positions
 from fourbar_ros.mechanism.mechanism import (
     FLYWHEEL_NAMES,
@@ -32,6 +27,7 @@ from fourbar_ros.mechanism.mechanism import (
     MechanismError,
     SENSOR_NAMES,
 )
+from fourbar_ros.mechanism.momentum import angular_momentum, kinetic_energy
 
 __all__ = [
     'angular_momentum', 'assemble', 'branch_of', 'closure_error', 'ClosureError',

@@ -14,18 +14,19 @@ are ignored, so that a file may carry its expected result.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 import json
 from pathlib import Path
 from typing import Any
 
 from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.settings import Setting
 from fourbar_ros.mechanism.closure import branch_of, check_motion, ClosureError
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.forces import NOTHING, Surroundings
 from fourbar_ros.mechanism.integration import move_with_cosines
-from fourbar_ros.mechanism.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism, numbers
+from fourbar_ros.mechanism.mechanism import checked_array, FLYWHEEL_NAMES, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.state import (
     LINK_ANGLES,
     LINK_RATES,
@@ -90,7 +91,7 @@ class Motion:
     flywheel_speeds_absolute: Array
 
     def branches(self) -> list[tuple[float, str]]:
-        """Tell on which branch the linkage was: from which time [s] on, and which."""
+        """Return the branches of the motion, each with the time from which it holds [s]."""
         changes: list[tuple[float, str]] = []
         for time, angles in zip(self.times, self.link_angles):
             branch = branch_of(angles)
@@ -104,19 +105,18 @@ def load_case(path: Path) -> Case:
     Read and check a case file.
 
     :raises CaseError: missing, unreadable, not JSON, or a value is missing or impossible.
-    :raises MechanismError: the mechanism is refused.
     """
     try:
         with open(path, encoding='utf-8') as file:
             values = json.load(file)
     except OSError as error:
-        raise CaseError(f'cannot read {path}: {error.strerror}') from None
+        raise CaseError(f'cannot read {path}: {error.strerror}', file=str(path)) from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CaseError(f'{path} is not JSON, or is cut: {error}') from None
+        raise CaseError(f'{path} is not JSON, or is cut: {error}', file=str(path)) from None
     try:
-        return _case_from(values, str(path))
-    except CaseError as error:
-        raise CaseError(f'{path}: {error}') from None
+        return _case_from(values)
+    except FourbarError as error:
+        raise error.at(path, CaseError) from None
 
 
 def simulate(case: Case, step: float = DEFAULT_STEP, around: Surroundings = NOTHING) -> Motion:
@@ -140,35 +140,44 @@ def simulate(case: Case, step: float = DEFAULT_STEP, around: Surroundings = NOTH
     if not finite.all():
         raise CaseError(
             f'the motion is no longer finite at t = {case.times[np.argmin(finite)]:g} s: '
-            f'torques too large for a step of {step:g} s')
+            f'torques too large for a step of {step:g} s', step=step)
     return Motion(
         case.times, states[:, LINK_ANGLES], states[:, LINK_RATES], states[:, WHEEL_ANGLES],
         states[:, WHEEL_SPEEDS])
 
 
-def _case_from(values: Any, origin: str) -> Case:
-    mechanism = Mechanism.from_mapping(_section(values, 'mechanism'), f'{origin}, mechanism')
-    initial = _section(values, 'initial')
-    zeros = [0.0, 0.0, 0.0, 0.0]
+_FIELDS = {row.name: row for row in (
+    Setting('link_angles', 0.0, 'rad', 'initial angles on the closure'),
+    Setting('link_rates', 0.0, 'rad/s', 'initial rates'),
+    Setting('flywheel_speeds_absolute', 0.0, 'rad/s', 'initial speeds'),
+    Setting('amplitude', 0.0, '', 'of the torque [N m] or the prescribed angle [rad]'),
+    Setting('frequency_hz', 0.0, 'Hz', 'of the torque or the prescribed angle'),
+    Setting('phase', 0.0, 'rad', 'of the torque or the prescribed angle'),
+    Setting('t', 0.0, 's', 'times, the first one that of the initial state'),
+)}
+_COSINE = ('amplitude', 'frequency_hz', 'phase')
+
+
+def _case_from(values: Any) -> Case:
+    mechanism = Mechanism.from_mapping(_section(values, 'mechanism'), 'mechanism')
+    initial = {'link_rates': [0.0] * 4, 'flywheel_speeds_absolute': [0.0] * 4,
+               **_section(values, 'initial')}
+    angles, rates, speeds = (_array(initial, name, LINK_NAMES) for name in (
+        'link_angles', 'link_rates', 'flywheel_speeds_absolute'))
     cosines, prescribed = _wheel_cosines(values)
-    case = Case(
-        mechanism,
-        _array(initial, 'link_angles', (4,)),
-        _array({'link_rates': zeros, **initial}, 'link_rates', (4,)),
-        _array({'flywheel_speeds_absolute': zeros, **initial}, 'flywheel_speeds_absolute', (4,)),
-        cosines[0], cosines[1], cosines[2], _array(values, 't', None), prescribed)
-    if case.times.size < 2 or not (np.diff(case.times) > 0.0).all():
-        raise CaseError('t must hold at least two increasing times')
+    times = _array(values, 't', None)
+    if times.size < 2 or not (np.diff(times) > 0.0).all():
+        raise CaseError('t must hold at least two increasing times', name='t')
     try:
-        check_motion(mechanism, case.link_angles, case.link_rates)
+        check_motion(mechanism, angles, rates)
     except ClosureError as error:
-        raise CaseError(f'initial: {error}') from None
-    return case
+        raise error.at('initial', CaseError) from None
+    return Case(mechanism, angles, rates, speeds, cosines[0], cosines[1], cosines[2], times,
+                prescribed)
 
 
 def _wheel_cosines(values: Mapping[str, Any]) -> tuple[Array, Array]:
     """Read amplitudes, frequencies and phases (3, 4), and which wheels are prescribed (4,)."""
-    names = ('amplitude', 'frequency_hz', 'phase')
     prescribed = np.zeros(4, dtype=bool)
     wheels: list[int] = []
     if 'wheel_angle' in values:
@@ -177,46 +186,45 @@ def _wheel_cosines(values: Mapping[str, Any]) -> tuple[Array, Array]:
     cosines = np.zeros((3, 4))
     if 'motor_torque' in values or not prescribed.all():
         torque = _section(values, 'motor_torque')
-        cosines[:] = [_array(torque, name, (4,)) for name in names]
+        cosines[:] = [_array(torque, name, FLYWHEEL_NAMES) for name in _COSINE]
         if wheels and cosines[0, wheels].any():
-            moved = wheels[int(np.argmax(cosines[0, wheels] != 0.0))]
-            raise CaseError(
-                f'{FLYWHEEL_NAMES[moved]} has a prescribed angle and a motor torque: only one of '
-                'the two can be given')
+            name = FLYWHEEL_NAMES[wheels[int(np.argmax(cosines[0, wheels] != 0.0))]]
+            raise CaseError(f'{name} has a prescribed angle and a motor torque: remove one of '
+                            'the two', name=name)
     if wheels:
-        angle = values['wheel_angle']
-        cosines[:, wheels] = [_array(angle, name, (len(wheels),)) for name in names]
+        names = [FLYWHEEL_NAMES[wheel] for wheel in wheels]
+        cosines[:, wheels] = [_array(values['wheel_angle'], name, names) for name in _COSINE]
     return cosines, prescribed
 
 
 def _wheels(names: Any) -> list[int]:
     if not isinstance(names, list) or not names or len(set(map(str, names))) < len(names):
-        raise CaseError(f'wheel_angle needs flywheels, a list of different names, got {names!r}')
+        raise CaseError(f'wheel_angle needs flywheels, a list of different names, got {names!r}',
+                        name='flywheels', value=names)
     if unknown := [name for name in names if name not in FLYWHEEL_NAMES]:
         raise CaseError(f'wheel_angle: no flywheel {unknown[0]!r} (known are '
-                        f'{", ".join(FLYWHEEL_NAMES)})')
+                        f'{", ".join(FLYWHEEL_NAMES)})', name='flywheels', value=unknown[0],
+                        limit=FLYWHEEL_NAMES)
     return [FLYWHEEL_NAMES.index(name) for name in names]
 
 
 def _section(values: Any, name: str) -> Mapping[str, Any]:
     if not isinstance(values, Mapping):
-        raise CaseError('must hold a JSON object')
+        raise CaseError('must hold a JSON object', value=values, limit=dict)
     section = values.get(name)
     if not isinstance(section, Mapping):
-        raise CaseError(f'{name} is missing or is not an object')
+        raise CaseError(f'{name} is missing or is not an object', name=name, value=section)
     return section
 
 
-def _array(values: Mapping[str, Any], name: str, shape: tuple[int, ...] | None) -> Array:
+def _array(values: Mapping[str, Any], name: str, elements: Sequence[str] | None) -> Array:
+    """
+    Return the list of that name.
+
+    :param elements: names of its elements, None for any number of them.
+    """
     if name not in values:
-        raise CaseError(f'{name} is missing')
-    array = numbers(name, values[name], CaseError)
-    if array.ndim != 1 or (shape is not None and array.shape != shape):
-        wanted = 'a list'
-        if shape:
-            wanted = f'{shape[0]} number{"s" * (shape[0] > 1)}' + (
-                f', in the order {", ".join(LINK_NAMES)}' if shape == (4,) else '')
-        raise CaseError(f'{name} must be {wanted}, got shape {array.shape}')
-    if not np.isfinite(array).all():
-        raise CaseError(f'{name} must be finite, got {array[~np.isfinite(array)][0]}')
-    return array
+        raise CaseError(f'{name} is missing', name=name)
+    if elements is None and isinstance(values[name], list):
+        elements = [str(place) for place in range(len(values[name]))]
+    return checked_array(_FIELDS[name], values[name], elements or ())

@@ -25,13 +25,14 @@ from numpy.typing import ArrayLike
 
 BRANCHES = ('open', 'crossed')
 
-# Each link's sign in the closure written as a sum that vanishes.
 SIGNS = (-1.0, 1.0, 1.0, -1.0)
+"""Sign of each link in the closure written as a sum that vanishes."""
 
-
-# How far a given state may be off the closure, relative to the longest link (and per second):
-# generous to rounded digits, far below any real mistake.
 TOLERANCE = 1e-6
+"""
+Largest closure error of a state, relative to the longest link, and of its rate per second: far
+above rounded digits, far below any real mistake.
+"""
 
 
 class ClosureError(FourbarError):
@@ -40,7 +41,7 @@ class ClosureError(FourbarError):
 
 def closure_error(mechanism: Mechanism, link_angles: ArrayLike) -> float:
     """
-    Measure the gap at joint 3.
+    Evaluate the gap at joint 3.
 
     :param link_angles: (4,) [rad].
     :returns: distance between the two ends that joint 3 should join [m].
@@ -52,7 +53,7 @@ def closure_error(mechanism: Mechanism, link_angles: ArrayLike) -> float:
 
 def branch_of(link_angles: ArrayLike) -> str:
     """
-    Tell which assembly the linkage is in.
+    Return the assembly of the linkage.
 
     A third one exists where l_a = l_b and l_c = l_d: joint 4 lies on joint 2, and the links turn
     as two pairs, a with b and c with d.
@@ -64,6 +65,17 @@ def branch_of(link_angles: ArrayLike) -> str:
     if abs(sin(b - a)) < FOLDED_SINE and abs(sin(d - c)) < FOLDED_SINE:
         return 'folded' if abs(sin(c - a)) > FOLDED_SINE else 'open'
     return 'crossed' if sin(b - a) * sin(d - c) < 0.0 else 'open'
+
+
+def check_branch(branch: str) -> None:
+    """
+    Refuse an assembly that `assemble` does not know.
+
+    :raises ClosureError: neither `open` nor `crossed`.
+    """
+    if branch not in BRANCHES:
+        raise ClosureError(f'unknown branch {branch!r} (known are {", ".join(BRANCHES)})',
+                           name='branch', value=branch, limit=BRANCHES)
 
 
 def check_motion(mechanism: Mechanism, link_angles: ArrayLike, link_rates: ArrayLike) -> None:
@@ -79,25 +91,28 @@ def check_motion(mechanism: Mechanism, link_angles: ArrayLike, link_rates: Array
     for name, values, unit in (('angle', angles, 'rad'), ('rate', rates, 'rad/s')):
         if not np.isfinite(values).all():
             n = int(np.argmin(np.isfinite(values)))
-            raise ClosureError(f'the {name} of {LINK_NAMES[n]} must be finite, got {values[n]} '
-                               f'{unit}')
+            raise ClosureError(
+                f'the {name} of {LINK_NAMES[n]} must be finite, got {values[n]} {unit}',
+                name=f'link_{name}s.{LINK_NAMES[n]}', value=float(values[n]))
     limit = TOLERANCE * float(mechanism.link_lengths.max())
     gap = closure_error(mechanism, angles)
     if gap > limit:
-        raise ClosureError(f'the link angles do not close the loop: gap {gap:.3g} m, limit '
-                           f'{limit:.3g} m')
+        raise ClosureError(
+            f'the link angles do not close the loop: gap {gap:.3g} m, limit {limit:.3g} m',
+            name='link_angles', value=gap, limit=limit)
     arms = np.array(SIGNS) * mechanism.link_lengths * rates
     slip = hypot(float(arms @ np.sin(angles)), float(arms @ np.cos(angles)))
     if slip > limit:
-        raise ClosureError('the link rates do not keep the loop closed: joint 3 would open at '
-                           f'{slip:.3g} m/s, limit {limit:.3g} m/s')
+        raise ClosureError(
+            f'the link rates do not keep the loop closed: joint 3 would open at {slip:.3g} m/s, '
+            f'limit {limit:.3g} m/s', name='link_rates', value=slip, limit=limit)
 
 
 def assemble(
     mechanism: Mechanism, phi_a: float, phi_b: float, branch: str = 'open',
 ) -> Array:
     """
-    Work out the four link angles from two and the branch.
+    Evaluate the four link angles from two and the branch.
 
     :param phi_a: orientation of link a [rad].
     :param phi_b: orientation of link b [rad].
@@ -105,8 +120,7 @@ def assemble(
     :returns: (4,) link angles [rad], c and d in (-pi, pi].
     :raises ClosureError: unknown branch, or the loop cannot close at this configuration.
     """
-    if branch not in BRANCHES:
-        raise ClosureError(f'unknown branch {branch!r} (known are {", ".join(BRANCHES)})')
+    check_branch(branch)
     solutions = solve_pair(mechanism, (0, 1), (phi_a, phi_b))
     for solution in solutions:
         if branch_of(solution) == branch:
@@ -118,9 +132,9 @@ def nearest_assembly(
     mechanism: Mechanism, known: tuple[int, int], angles: tuple[float, float], near: ArrayLike,
 ) -> Array:
     """
-    Complete two link angles to four, on the branch nearest to given angles.
+    Complete two link angles to four, on the branch nearest to other angles.
 
-    Parameters and errors as in :func:`assemblies`, of which this is the first.
+    Returns the first result of :func:`assemblies`, with the same parameters and errors.
     """
     return assemblies(mechanism, known, angles, near)[0]
 
@@ -131,11 +145,11 @@ def assemblies(
     """
     Complete two link angles to four, on both branches.
 
-    :param known: indices of the two links that are given (0 for link a).
+    :param known: indices of the two known links (0 for link a).
     :param angles: their orientations [rad].
-    :param near: (4,) link angles [rad]; of the results, the two that are worked out are continuous
-        with them (not wrapped).
-    :returns: two arrays (4,) of link angles, the one nearer to the given ones first [rad].
+    :param near: (4,) link angles [rad]. The two other angles are continuous with them, not
+        wrapped.
+    :returns: two arrays (4,) of link angles, the one nearer to `near` first [rad].
     :raises ClosureError: the loop cannot close, or the two links do not determine it.
     """
     # Plain numbers: arrays of four cost ten times as much, and this is called at every tick.
@@ -172,7 +186,8 @@ def assemble_along(mechanism: Mechanism, phi_a: Array, phi_b: Array, start: Arra
         n = int(np.argmax(open_loop))
         raise ClosureError(
             f'the loop cannot close at link_a = {phi_a[n]:.4f} rad and link_b = {phi_b[n]:.4f} '
-            f'rad: link_c and link_d reach {short:g} to {long:g} m, needed are {gap[n]:g} m')
+            f'rad: link_c and link_d reach {short:g} to {long:g} m, needed are {gap[n]:g} m',
+            value=float(gap[n]), limit=(float(short), float(long)))
     side = 1.0 if sin(begin[3] - begin[2]) >= 0.0 else -1.0
     cosine = (gap * gap + l_c * l_c - l_d * l_d) / (2.0 * gap * l_c)
     phi_c = np.arctan2(gap_y, gap_x) + side * np.arccos(np.clip(cosine, -1.0, 1.0))
@@ -187,11 +202,11 @@ def solve_pair(
     mechanism: Mechanism, known: tuple[int, int], angles: tuple[float, float],
 ) -> list[Array]:
     """
-    Work out the two other link angles from any two: both solutions.
+    Evaluate both solutions for the two other link angles.
 
-    :param known: indices of the two links that are given (0 for link a).
+    :param known: indices of the two known links (0 for link a).
     :param angles: their orientations [rad].
-    :returns: two arrays (4,) of link angles [rad], the worked out ones in (-pi, pi].
+    :returns: two arrays (4,) of link angles [rad], those of the other links in (-pi, pi].
     :raises ClosureError: the loop cannot close, or the two links do not determine it.
     """
     return [np.array(solution) for solution in _solve_pair(mechanism, known, angles)]
@@ -204,7 +219,8 @@ def _solve_pair(
     k, m = (index for index in range(4) if index not in known)
     lengths: list[float] = mechanism.link_lengths.tolist()
     if not (isfinite(angles[0]) and isfinite(angles[1])):
-        raise ClosureError(f'link angles must be finite, got {angles[0]} and {angles[1]}')
+        raise ClosureError(f'link angles must be finite, got {angles[0]} and {angles[1]}',
+                           name='link_angles', value=angles)
     # s_k l_k e_k + s_m l_m e_m = gap: a triangle with sides l_k, l_m and the gap.
     arm_i, arm_j = SIGNS[i] * lengths[i], SIGNS[j] * lengths[j]
     gap_x = -(arm_i * cos(angles[0]) + arm_j * cos(angles[1]))
@@ -212,13 +228,15 @@ def _solve_pair(
     gap = hypot(gap_x, gap_y)
     side_k, side_m = lengths[k], lengths[m]
     if gap < 1e-9 * (side_k + side_m):
-        raise ClosureError(f'{_named(known, angles)} do not determine the configuration')
+        raise ClosureError(f'{_named(known, angles)} do not determine the configuration',
+                           undetermined=tuple(LINK_NAMES[link] for link in known))
     cosine = (gap * gap + side_k * side_k - side_m * side_m) / (2.0 * gap * side_k)
     if abs(cosine) > 1.0 + 1e-12:
+        limit = abs(side_k - side_m), side_k + side_m
         raise ClosureError(
             f'the loop cannot close at {_named(known, angles)}: {LINK_NAMES[k]} and '
-            f'{LINK_NAMES[m]} reach {abs(side_k - side_m):g} to {side_k + side_m:g} m, needed are '
-            f'{gap:g} m')
+            f'{LINK_NAMES[m]} reach {limit[0]:g} to {limit[1]:g} m, needed are {gap:g} m',
+            value=gap, limit=limit)
     spread = acos(max(-1.0, min(1.0, cosine)))
     solutions = []
     for side in (1.0, -1.0):
@@ -236,6 +254,6 @@ def _solve_pair(
 
 
 def _named(known: tuple[int, int], angles: tuple[float, float]) -> str:
-    """Name two given link angles."""
+    """Return two known link angles as text."""
     return ' and '.join(f'{LINK_NAMES[link]} = {angle:.4f} rad'
                         for link, angle in zip(known, angles))

@@ -18,7 +18,7 @@ from math import cos, hypot, nan, sin, sqrt
 
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.kernels.linear_algebra import Vector4
-from fourbar_ros.mechanism.closure import BRANCHES, ClosureError
+from fourbar_ros.mechanism.closure import check_branch
 from fourbar_ros.mechanism.constants import Array, Constants, PAIRS
 from fourbar_ros.mechanism.mechanism import Mechanism
 from fourbar_ros.mechanism.reduced import close_loop, pair_inertias, reduced_terms
@@ -71,8 +71,7 @@ def conditioning_grid(mechanisms: Sequence[Mechanism], thetas: ArrayLike, branch
     :param branch: `open` or `crossed`.
     :raises ClosureError: there is no such branch.
     """
-    if branch not in BRANCHES:
-        raise ClosureError(f'unknown branch {branch!r} (known are {", ".join(BRANCHES)})')
+    check_branch(branch)
     constants = np.array([mechanism.constants for mechanism in mechanisms])
     found = _grid(constants, np.ascontiguousarray(thetas, dtype=float),
                   1.0 if branch == 'open' else -1.0, WHEELS.astype(float))
@@ -96,10 +95,10 @@ def _evaluate(constants: Constants, cosine: float, sine: float, branch: float, w
                           constants.lengths[3])
     out[:] = nan
     side = branch if sine >= 0.0 else -branch
-    cx, cy, dx, dy, fold, inverse_fold = close_loop(cosine, sine, side, constants.lengths)
+    links, fold, inverse_fold = close_loop(cosine, sine, side, constants.lengths)
     # Links with their signs in the closure; J = (-y; x).
-    x = (-l_a, l_b * cosine, cx, -dx)
-    y = (0.0, l_b * sine, cy, -dy)
+    x = (-l_a, l_b * cosine, links.cx, -links.dx)
+    y = (0.0, l_b * sine, links.cy, -links.dy)
     first, second, determinant = motions(x, y)
     # Written so that NaN, a loop that cannot close, leaves everything blank.
     if not determinant > 0.0:
@@ -110,18 +109,16 @@ def _evaluate(constants: Constants, cosine: float, sine: float, branch: float, w
         xy += x[i] * y[i]
         yy += y[i] * y[i]
     largest = 0.5 * (xx + yy) + hypot(0.5 * (xx - yy), xy)
-    a00, a01, a11, _, _, _, _, _, _, _, _ = reduced_terms(
-        cosine, sine, cx, cy, dx, dy, inverse_fold, 0.0, 0.0, constants)
-    out[0] = _condition(a00, a01, a11)
-    m_ab, m_ac, m_ad, m_bc, m_bd, m_cd, _, _, _, _, _, _ = pair_inertias(
-        cosine, sine, cx, cy, dx, dy, constants)
+    terms = reduced_terms(links, inverse_fold, 0.0, 0.0, constants)
+    out[0] = _condition(terms.a00, terms.a01, terms.a11)
+    pairs = pair_inertias(links, constants)
     inertia = np.diag(constants.own_inertias)
-    inertia[0, 1] = inertia[1, 0] = m_ab
-    inertia[0, 2] = inertia[2, 0] = m_ac
-    inertia[0, 3] = inertia[3, 0] = m_ad
-    inertia[1, 2] = inertia[2, 1] = m_bc
-    inertia[1, 3] = inertia[3, 1] = m_bd
-    inertia[2, 3] = inertia[3, 2] = m_cd
+    inertia[0, 1] = inertia[1, 0] = pairs.m_ab
+    inertia[0, 2] = inertia[2, 0] = pairs.m_ac
+    inertia[0, 3] = inertia[3, 0] = pairs.m_ad
+    inertia[1, 2] = inertia[2, 1] = pairs.m_bc
+    inertia[1, 3] = inertia[3, 1] = pairs.m_bd
+    inertia[2, 3] = inertia[3, 2] = pairs.m_cd
     of_first, of_second = inertia @ first, inertia @ second
     out[1] = _condition((first * of_first).sum(), (first * of_second).sum(),
                         (second * of_second).sum())

@@ -23,6 +23,8 @@ PAIRS = tuple(combinations(range(4), 2))
 JOINTS = (((0, False), (1, False)), ((1, True), (2, False)),
           ((3, True), (2, True)), ((0, True), (3, False)))
 
+Fields = list[tuple[str, Any, tuple[int, ...]]]
+"""Name, type and shape of the fields of a record."""
 
 # The constants of the equations of motion (SI units), one record that kernels take as a whole.
 #
@@ -33,7 +35,7 @@ JOINTS = (((0, False), (1, False)), ((1, True), (2, False)),
 #
 # A wheel whose motion relative to its link is prescribed turns with the link as far as inertia
 # goes: its axial inertia is in `cosine`, and `prescribed` is 1.
-FIELDS: list[tuple[str, type, tuple[int, ...]]] = [
+FIELDS: Fields = [
     ('lengths', float, (4,)),               # m
     ('cosine', float, (4, 4)),              # kg m^2
     ('sine', float, (4, 4)),                # kg m^2
@@ -57,8 +59,8 @@ Constants = np.record
 """A scalar of `FIELDS`; numba knows its fields by name."""
 
 
-def record(fields: list[tuple[str, type, tuple[int, ...]]], **values: Any) -> np.record:
-    """Fill a read-only record."""
+def record(fields: Fields, **values: Any) -> np.record:
+    """Return a read-only record with these values."""
     filled = np.zeros((), np.dtype((np.record, fields)))
     for name, value in values.items():
         filled[name] = value

@@ -13,6 +13,7 @@ one (docs/mechanics.md, change points). Vectors are in the frame of link a.
 from __future__ import annotations
 
 from math import cos, sin, sqrt
+from typing import NamedTuple
 
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.kernels.linear_algebra import (
@@ -23,8 +24,16 @@ from fourbar_ros.kernels.linear_algebra import (
     multiply,
     solve_lower,
     solve_upper,
+    total,
     Triangle,
     Vector4,
+)
+from fourbar_ros.kernels.runge_kutta import (
+    Drive,
+    interpolate,
+    later_stages_of,
+    weighted_sum,
+    weighted_sums,
 )
 from fourbar_ros.mechanism.change_points import (
     FREE_CONSTRAINT_RATIO,
@@ -32,21 +41,64 @@ from fourbar_ros.mechanism.change_points import (
     WEAK_CONSTRAINT_RATIO,
 )
 from fourbar_ros.mechanism.constants import Array, Constants
-from fourbar_ros.mechanism.forces import generalized_forces, Surroundings
+from fourbar_ros.mechanism.forces import generalized_forces, System
 from fourbar_ros.mechanism.reduced import (
+    link_momentum,
+    LinkVectors,
     move_centre,
     pair_inertias,
-    remembered_spin,
-    spin,
+    summed_momentum,
     turn,
 )
-from fourbar_ros.mechanism.state import SPIN, VELOCITY_X, VELOCITY_Y
+from fourbar_ros.mechanism.state import (
+    ANGLE,
+    angles_of,
+    LINK_MOMENTUM,
+    RATE,
+    rates_of,
+    VELOCITY_X,
+    VELOCITY_Y,
+)
 import numpy as np
 
-# Largest change of the acceleration between the two middle stages of a step, times the step and
-# relative to the rates; and the largest number of parts that a step is divided into to keep it.
+# A step that is too long for the motion is divided into parts. It is too long where the
+# acceleration changes between its two middle stages by more than this, times the step and relative
+# to the rates; MOST_PARTS bounds the time of a step.
 RESOLUTION = 1e-4
 MOST_PARTS = 256
+
+
+class LinkMotion(NamedTuple):
+    """
+    A motion of all four links and the mass centre.
+
+    :ivar angle_a: phi_a, which only the forces from outside depend on [rad].
+    :ivar cosines, sines: of the link angles less that of link a.
+    :ivar rates: of the links [rad/s].
+    :ivar velocity: of the mass centre, x and y [m/s].
+    """
+
+    angle_a: float
+    cosines: Vector4
+    sines: Vector4
+    rates: Vector4
+    velocity: tuple[float, float]
+
+
+class ConstrainedStage(NamedTuple):
+    """
+    The derivatives of a motion.
+
+    :ivar rates: of the links [rad/s].
+    :ivar accelerations: of the links [rad/s^2].
+    :ivar centre: acceleration of the mass centre, x and y [m/s^2].
+    :ivar torque: sum of the torques on the links [N m].
+    """
+
+    rates: Vector4
+    accelerations: Vector4
+    centre: tuple[float, float]
+    torque: float
 
 
 @kernel
@@ -57,39 +109,31 @@ def directions(angles: Vector4) -> tuple[Vector4, Vector4]:
 
 
 @kernel
-def constrained_accelerations(
-    angle_a: float, cosines: Vector4, sines: Vector4, rates: Vector4,
-    velocity: tuple[float, float], torques: Array, constants: Constants, around: Surroundings,
-    weak_held: bool,
-) -> tuple[Vector4, tuple[float, float], float]:
+def constrained_accelerations(motion: LinkMotion, torques: Array, system: System, weak_held: bool
+                              ) -> ConstrainedStage:
     """
     Solve the constrained form.
 
-    :param angle_a: phi_a, of which only the surroundings know [rad].
-    :param cosines, sines: of the link angles less that of link a.
-    :param rates: of the links [rad/s].
-    :param velocity: of the mass centre [m/s].
     :param torques: (4,) of the motors on the wheels [N m]; each link feels the opposite.
-    :param weak_held: False where the weak direction is as free as it is at a change point; for
-        who does not know the angles well enough to tell which way the linkage is off it.
-    :returns: accelerations of the links [rad/s^2] and of the mass centre [m/s^2], and the sum of
-        the torques on the links [N m].
+    :param weak_held: False where the weak direction is as free as it is at a change point, for an
+        estimator whose angles are too uncertain to tell the side of the change point.
     """
+    constants = system.constants
+    cosines, sines, rates = motion.cosines, motion.sines, motion.rates
     factor, bias = factored_inertia(cosines, sines, rates, constants)
     forces = (-torques[0], -torques[1], -torques[2], -torques[3])
-    push = (0.0, 0.0)
-    if around.acting:
-        ca, sa = cos(angle_a), sin(angle_a)
-        effects, push = generalized_forces(
-            combine(ca, cosines, -sa, sines), combine(ca, sines, sa, cosines), rates, velocity,
-            constants, around)
+    on_centre = (0.0, 0.0)
+    if system.around.acting:
+        ca, sa = cos(motion.angle_a), sin(motion.angle_a)
+        effects, on_centre = generalized_forces(
+            combine(ca, cosines, -sa, sines), combine(ca, sines, sa, cosines), rates,
+            motion.velocity, system)
         forces = combine(1.0, forces, 1.0, effects)
-    total = forces[0] + forces[1] + forces[2] + forces[3]
     free = solve_upper(factor, solve_lower(factor, combine(1.0, forces, -1.0, bias)))
     # A turn of the whole changes no derivative of the closure.
-    mean = 0.25 * (rates[0] + rates[1] + rates[2] + rates[3])
+    mean = 0.25 * total(rates)
     w = (rates[0] - mean, rates[1] - mean, rates[2] - mean, rates[3] - mean)
-    # s_i l_i e_i: J alpha is the sum of it times rate^2; J is it, turned by a quarter.
+    # s_i l_i e_i: J alpha is its sum with the squared rates; J is it, turned by a quarter.
     x, y = signed_links(cosines, sines, constants.lengths)
     square = multiply(w, w)
     need_x, need_y = dot(x, square) + dot(y, free), dot(y, square) - dot(x, free)
@@ -99,10 +143,10 @@ def constrained_accelerations(
     if weak_held and remains < WEAK_CONSTRAINT_RATIO * WEAK_CONSTRAINT_RATIO * size:
         # Third derivative: J d(alpha)/dt - 3 sum s l e rate alpha - sum s l E e rate^3 = 0.
         cube = multiply(w, square)
-        pull_x, pull_y = multiply(x, w), multiply(y, w)
-        third_x, third_y = 3.0 * dot(pull_x, free) - dot(y, cube), 3.0 * dot(
-            pull_y, free) + dot(x, cube)
-        third = solve_lower(factor, combine(-3.0 * c, pull_y, 3.0 * s, pull_x))
+        slope_x, slope_y = multiply(x, w), multiply(y, w)
+        third_x, third_y = 3.0 * dot(slope_x, free) - dot(y, cube), 3.0 * dot(
+            slope_y, free) + dot(x, cube)
+        third = solve_lower(factor, combine(-3.0 * c, slope_y, 3.0 * s, slope_x))
         along = dot(third, strong) / size
         third = combine(1.0, third, -along, strong)
         need_third = c * third_y - s * third_x - along * need_strong
@@ -120,12 +164,31 @@ def constrained_accelerations(
     correction = combine(need_strong / size, strong, share, weak)
     accelerations = combine(1.0, free, 1.0, solve_upper(factor, correction))
     mass = constants.total_mass
-    return accelerations, (push[0] / mass, push[1] / mass), total
+    return ConstrainedStage(
+        rates, accelerations, (on_centre[0] / mass, on_centre[1] / mass), total(forces))
+
+
+@kernel(forceinline=True)
+def _stage(number: int, start: LinkMotion, previous: ConstrainedStage, time: float,
+           torques: Array, held_system: tuple[System, bool]) -> ConstrainedStage:
+    """Evaluate a stage of the Runge-Kutta step, see `later_stages_of`."""
+    system, weak_held = held_system
+    rates = previous.rates
+    cb, sb = turn(start.cosines[1], start.sines[1], time * (rates[1] - rates[0]))
+    cc, sc = turn(start.cosines[2], start.sines[2], time * (rates[2] - rates[0]))
+    cd, sd = turn(start.cosines[3], start.sines[3], time * (rates[3] - rates[0]))
+    return constrained_accelerations(LinkMotion(
+        start.angle_a + time * rates[0], (1.0, cb, cc, cd), (0.0, sb, sc, sd),
+        combine(1.0, start.rates, time, previous.accelerations),
+        (start.velocity[0] + time * previous.centre[0],
+         start.velocity[1] + time * previous.centre[1])), torques, system, weak_held)
+
+
+_later_stages = later_stages_of(_stage)
 
 
 @kernel
-def advance_constrained(state: Array, start: Array, middle: Array, end: Array, step: float,
-                        constants: Constants, around: Surroundings, weak_held: bool
+def advance_constrained(state: Array, drive: Drive, step: float, system: System, weak_held: bool
                         ) -> None:
     """
     Advance links and mass centre by one Runge-Kutta step of order four, in place.
@@ -133,95 +196,65 @@ def advance_constrained(state: Array, start: Array, middle: Array, end: Array, s
     Where lengths that almost match let the links turn over faster than the step can follow, it is
     divided. Parameters as of `advance_reduced` and `constrained_accelerations`.
     """
-    if _advance_once(state, start, middle, end, step, False, constants, around, weak_held):
+    if _advance_once(state, drive, step, system, weak_held, False):
         return
     parts, before = 2, state.copy()
-    while not _advance_in_parts(state, start, middle, end, step, parts, constants, around,
-                                weak_held):
+    while not _advance_in_parts(state, drive, step, parts, system, weak_held):
         state[:] = before
         parts *= 2
 
 
 @kernel
-def _advance_in_parts(state: Array, start: Array, middle: Array, end: Array, step: float,
-                      parts: int, constants: Constants, around: Surroundings, weak_held: bool
-                      ) -> bool:
-    """Tell whether that many parts were enough."""
+def _advance_in_parts(state: Array, drive: Drive, step: float, parts: int, system: System,
+                      weak_held: bool) -> bool:
+    """Return whether the number of parts resolves the motion."""
     torques = np.empty((3, 4))
     for part in range(parts):
         for stage in range(3):
-            interpolate(start, middle, end, (part + 0.5 * stage) / parts, torques[stage])
-        if not _advance_once(state, torques[0], torques[1], torques[2], step / parts,
-                             parts >= MOST_PARTS, constants, around, weak_held):
+            interpolate(drive, (part + 0.5 * stage) / parts, torques[stage])
+        if not _advance_once(state, Drive(torques[0], torques[1], torques[2]), step / parts,
+                             system, weak_held, parts >= MOST_PARTS):
             return False
     return True
 
 
 @kernel
-def interpolate(start: Array, middle: Array, end: Array, part: float, out: Array) -> None:
-    """Put a parabola through what drives the wheels in a step, at a part of it (0 to 1)."""
-    for j in range(4):
-        out[j] = (start[j] * (1.0 - part) * (1.0 - 2.0 * part) + middle[j] * 4.0 * part * (
-            1.0 - part) + end[j] * part * (2.0 * part - 1.0))
-
-
-@kernel
-def _advance_once(state: Array, start: Array, middle: Array, end: Array, step: float,
-                  at_any_length: bool, constants: Constants, around: Surroundings,
-                  weak_held: bool) -> bool:
+def _advance_once(state: Array, drive: Drive, step: float, system: System, weak_held: bool,
+                  unresolved: bool) -> bool:
     """
-    Take one step, then meet the closure again, and angular momentum as in `advance_reduced`.
+    Take one step, then restore the closure, and angular momentum as in `advance_reduced`.
 
-    :param at_any_length: take the step even if it is too long to follow the motion.
-    :returns: whether it was taken; otherwise nothing was changed.
+    :param unresolved: take the step even if it is too long to follow the motion.
+    :returns: whether the step was taken; otherwise nothing was changed.
     """
-    a0, b0, c0, d0 = state[0], state[1], state[2], state[3]
-    angles, rates = (a0, b0, c0, d0), (state[4], state[5], state[6], state[7])
-    velocity = (state[VELOCITY_X], state[VELOCITY_Y])
-    half, sixth = 0.5 * step, step / 6.0
+    angles, rates, constants = angles_of(state), rates_of(state), system.constants
     cosines, sines = directions(angles)
-    alpha1, pull1, sum1 = constrained_accelerations(
-        a0, cosines, sines, rates, velocity, start, constants, around, weak_held)
-    rates2 = combine(1.0, rates, half, alpha1)
-    cosines2, sines2 = _turned(cosines, sines, rates, half)
-    alpha2, pull2, sum2 = constrained_accelerations(
-        a0 + half * rates[0], cosines2, sines2, rates2,
-        (velocity[0] + half * pull1[0], velocity[1] + half * pull1[1]), middle, constants, around,
-        weak_held)
-    rates3 = combine(1.0, rates, half, alpha2)
-    cosines3, sines3 = _turned(cosines, sines, rates2, half)
-    alpha3, pull3, sum3 = constrained_accelerations(
-        a0 + half * rates2[0], cosines3, sines3, rates3,
-        (velocity[0] + half * pull2[0], velocity[1] + half * pull2[1]), middle, constants, around,
-        weak_held)
-    rates4 = combine(1.0, rates, step, alpha3)
-    cosines4, sines4 = _turned(cosines, sines, rates3, step)
-    alpha4, pull4, sum4 = constrained_accelerations(
-        a0 + step * rates3[0], cosines4, sines4, rates4,
-        (velocity[0] + step * pull3[0], velocity[1] + step * pull3[1]), end, constants, around,
-        weak_held)
+    motion = LinkMotion(
+        angles[0], cosines, sines, rates, (state[VELOCITY_X], state[VELOCITY_Y]))
+    first = constrained_accelerations(motion, drive.start, system, weak_held)
+    second, third, fourth = _later_stages(
+        motion, first, drive, step, (system, weak_held))
 
-    mean_rates = _weighted_mean(rates, rates2, rates3, rates4)
-    before, _ = _spin(cosines, sines, rates, constants)
-    angles = combine(1.0, angles, step, mean_rates)
-    rates = combine(1.0, rates, step, _weighted_mean(alpha1, alpha2, alpha3, alpha4))
+    before, _ = _momentum(cosines, sines, rates, constants)
+    angles = combine(1.0, angles, 1.0, weighted_sums(
+        step, first.rates, second.rates, third.rates, fourth.rates))
+    rates = combine(1.0, rates, 1.0, weighted_sums(
+        step, first.accelerations, second.accelerations, third.accelerations,
+        fourth.accelerations))
     angles, rates = project_onto_closure(angles, rates, constants, weak_held)
-    change = combine(1.0, alpha3, -1.0, alpha2)
-    followed = step * sqrt(dot(change, change)) <= RESOLUTION * sqrt(dot(rates, rates))
-    if not (followed or at_any_length):
+    change = combine(1.0, third.accelerations, -1.0, second.accelerations)
+    resolved = step * sqrt(dot(change, change)) <= RESOLUTION * sqrt(dot(rates, rates))
+    if not (resolved or unresolved):
         return False
     cosines, sines = directions(angles)
-    after, inertia = _spin(cosines, sines, rates, constants)
-    before = remembered_spin(state, before, inertia)
-    state[SPIN] = before + sixth * (sum1 + 2.0 * (sum2 + sum3) + sum4)
-    missing = (state[SPIN] - after) / inertia
+    present, inertia = _momentum(cosines, sines, rates, constants)
+    state[LINK_MOMENTUM] = summed_momentum(state, before, inertia) + weighted_sum(
+        step, first.torque, second.torque, third.torque, fourth.torque)
+    missing = (state[LINK_MOMENTUM] - present) / inertia
     for j in range(4):
-        state[j] = angles[j]
-        state[4 + j] = rates[j] + missing
-    move_centre(state, step, velocity[0], velocity[1],
-                sixth * (pull1[0] + pull2[0] + pull3[0]), sixth * (pull1[1] + pull2[1] + pull3[1]),
-                sixth * (pull1[0] + 2.0 * (pull2[0] + pull3[0]) + pull4[0]),
-                sixth * (pull1[1] + 2.0 * (pull2[1] + pull3[1]) + pull4[1]))
+        state[ANGLE + j] = angles[j]
+        state[RATE + j] = rates[j] + missing
+    move_centre(state, step, first.centre, second.centre, third.centre, fourth.centre)
     return True
 
 
@@ -246,7 +279,7 @@ def project_onto_closure(angles: Vector4, rates: Vector4, constants: Constants, 
     size, remains = dot(strong, strong), dot(weak, weak)
     held = weak_held and remains > WEAK_CONSTRAINT_RATIO * WEAK_CONSTRAINT_RATIO * size
     # J = (-y; x): the gap is (sum x, sum y) and opens at (-y . rates, x . rates).
-    gap_x, gap_y = x[0] + x[1] + x[2] + x[3], y[0] + y[1] + y[2] + y[3]
+    gap_x, gap_y = total(x), total(y)
     slip_x, slip_y = -dot(y, rates), dot(x, rates)
     closing = combine(-(c * gap_x + s * gap_y) / size, strong,
                       -(c * gap_y - s * gap_x) / remains if held else 0.0, weak)
@@ -270,28 +303,16 @@ def rates_of_impulse(angles: Vector4, impulse: Vector4, constants: Constants) ->
 
 
 @kernel
-def _turned(cosines: Vector4, sines: Vector4, rates: Vector4, time: float
-            ) -> tuple[Vector4, Vector4]:
-    """Turn the directions on, at rates [rad/s] for a time [s]."""
-    cb, sb = turn(cosines[1], sines[1], time * (rates[1] - rates[0]))
-    cc, sc = turn(cosines[2], sines[2], time * (rates[2] - rates[0]))
-    cd, sd = turn(cosines[3], sines[3], time * (rates[3] - rates[0]))
-    return (1.0, cb, cc, cd), (0.0, sb, sc, sd)
+def _momentum(cosines: Vector4, sines: Vector4, rates: Vector4, constants: Constants
+              ) -> tuple[float, float]:
+    return link_momentum(_vectors(cosines, sines, constants), rates, constants)
 
 
 @kernel
-def _weighted_mean(first: Vector4, second: Vector4, third: Vector4, fourth: Vector4) -> Vector4:
-    """Return the Runge-Kutta mean of order four."""
-    return combine(1 / 6, combine(1.0, first, 1.0, fourth), 1 / 3, combine(
-        1.0, second, 1.0, third))
-
-
-@kernel
-def _spin(cosines: Vector4, sines: Vector4, rates: Vector4, constants: Constants
-          ) -> tuple[float, float]:
+def _vectors(cosines: Vector4, sines: Vector4, constants: Constants) -> LinkVectors:
     l_c, l_d = constants.lengths[2], constants.lengths[3]
-    return spin(cosines[1], sines[1], l_c * cosines[2], l_c * sines[2], l_d * cosines[3],
-                l_d * sines[3], rates[0], rates[1], rates[2], rates[3], constants)
+    return LinkVectors(cosines[1], sines[1], l_c * cosines[2], l_c * sines[2],
+                       l_d * cosines[3], l_d * sines[3])
 
 
 @kernel
@@ -305,10 +326,8 @@ def signed_links(cosines: Vector4, sines: Vector4, lengths: Array) -> tuple[Vect
 def factored_inertia(cosines: Vector4, sines: Vector4, rates: Vector4, constants: Constants
              ) -> tuple[Triangle, Vector4]:
     """Factor M into L L^T, and evaluate the bias h."""
-    l_c, l_d = constants.lengths[2], constants.lengths[3]
     m_ab, m_ac, m_ad, m_bc, m_bd, m_cd, n_ab, n_ac, n_ad, n_bc, n_bd, n_cd = pair_inertias(
-        cosines[1], sines[1], l_c * cosines[2], l_c * sines[2], l_d * cosines[3],
-        l_d * sines[3], constants)
+        _vectors(cosines, sines, constants), constants)
     qa, qb, qc, qd = multiply(rates, rates)
     bias = (n_ab * qb + n_ac * qc + n_ad * qd, -n_ab * qa + n_bc * qc + n_bd * qd,
             -n_ac * qa - n_bc * qb + n_cd * qd, -n_ad * qa - n_bd * qb - n_cd * qc)

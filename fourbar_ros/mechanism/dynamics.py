@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The quantities of Kane dynamics for everyone outside the integrator.
+The terms of the equations of motion, for controllers, estimators and studies.
 
-Paper eq. 6 (`reduced_form`), Gamma, the mass matrix of the four link angles, momentum and energy.
-They come from the kernels that integrate the motion (reduced.py, constrained.py).
+Paper eq. 6 (`reduced_form`), Gamma, and the mass matrix of the four link angles. They come from
+the kernels that integrate the motion (reduced.py).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.mechanism import Mechanism
-from fourbar_ros.mechanism.reduced import gammas, reduced_terms
+from fourbar_ros.mechanism.reduced import gammas, LinkVectors, reduced_terms, ReducedTerms
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -53,49 +53,17 @@ def reduced_form(mechanism: Mechanism, link_angles: ArrayLike, link_rates: Array
     Evaluate paper eq. 6 (corrected as docs/mechanics.md says) for any linkage.
 
     :param link_angles: (4,) on the closure [rad].
-    :param link_rates: (2,) omega_a, omega_b, or (4,) of which the first two count [rad/s].
+    :param link_rates: (2,) omega_a, omega_b, or (4,), the last two ignored [rad/s].
     :raises ChangePointError: links c and d lie on a line, where Gamma does not exist.
     """
     angles = np.asarray(link_angles, dtype=float)
     rates = np.asarray(link_rates, dtype=float)
     if sin(angles[3] - angles[2]) == 0.0:
         raise ChangePointError('links c and d lie on a line: Gamma does not exist here')
-    a00, a01, a11, b0, b1, g1, g2, g3, g4, _, _ = reduced_terms_at(
-        angles, rates, mechanism.constants)
+    terms = reduced_terms_at(angles, rates, mechanism.constants)
     return ReducedForm(
-        np.array([[a00, a01], [a01, a11]]), np.array([b0, b1]), np.array([[g1, g2], [g3, g4]]))
-
-
-def angular_momentum(mechanism: Mechanism, link_angles: ArrayLike, link_rates: ArrayLike,
-                     wheel_speeds: ArrayLike) -> float:
-    """
-    Sum up the angular momentum about the mass centre of the whole, links and wheels.
-
-    For rigid joints.
-
-    :param link_angles: (4,) [rad].
-    :param link_rates: (4,) [rad/s].
-    :param wheel_speeds: (4,) absolute speeds, link rate plus speed relative to the link [rad/s].
-    :returns: [kg m^2/s].
-    """
-    rates = np.asarray(link_rates, dtype=float)
-    matrix = mass_matrix(np.asarray(link_angles, dtype=float), mechanism.constants)
-    return float((matrix @ rates).sum()
-                 + mechanism.flywheel_inertias @ np.asarray(wheel_speeds, dtype=float))
-
-
-def kinetic_energy(mechanism: Mechanism, link_angles: ArrayLike, link_rates: ArrayLike,
-                   wheel_speeds: ArrayLike) -> float:
-    """
-    Sum up the kinetic energy relative to the mass centre, links and wheels.
-
-    Parameters as in :func:`angular_momentum`; returns [J].
-    """
-    rates = np.asarray(link_rates, dtype=float)
-    wheels = np.asarray(wheel_speeds, dtype=float)
-    matrix = mass_matrix(np.asarray(link_angles, dtype=float), mechanism.constants)
-    return float(rates @ matrix @ rates
-                 + mechanism.flywheel_inertias @ (wheels * wheels)) / 2.0
+        np.array([[terms.a00, terms.a01], [terms.a01, terms.a11]]),
+        np.array([terms.b0, terms.b1]), np.array([[terms.g1, terms.g2], [terms.g3, terms.g4]]))
 
 
 @kernel
@@ -113,25 +81,22 @@ def mass_matrix(angles: Array, constants: Constants) -> Array:
 @kernel
 def gamma_matrix(angles: Array, lengths: Array) -> Array:
     """Evaluate Gamma (2, 2) of four link angles: (omega_c, omega_d) = Gamma (omega_a, omega_b)."""
-    c, s, cx, cy, dx, dy, inverse_fold = _vectors(angles, lengths)
-    g1, g2, g3, g4 = gammas(c, s, cx, cy, dx, dy, inverse_fold, lengths)
+    links, inverse_fold = _vectors(angles, lengths)
+    g1, g2, g3, g4 = gammas(links, inverse_fold, lengths)
     return np.array([[g1, g2], [g3, g4]])
 
 
 @kernel
-def reduced_terms_at(
-    angles: Array, rates: Array, constants: Constants,
-) -> tuple[float, float, float, float, float, float, float, float, float, float, float]:
+def reduced_terms_at(angles: Array, rates: Array, constants: Constants) -> ReducedTerms:
     """Evaluate `reduced_terms` from the four link angles."""
-    c, s, cx, cy, dx, dy, inverse_fold = _vectors(angles, constants.lengths)
-    return reduced_terms(c, s, cx, cy, dx, dy, inverse_fold, rates[0], rates[1], constants)
+    links, inverse_fold = _vectors(angles, constants.lengths)
+    return reduced_terms(links, inverse_fold, rates[0], rates[1], constants)
 
 
 @kernel
-def _vectors(angles: Array, lengths: Array
-             ) -> tuple[float, float, float, float, float, float, float]:
-    """Return what `close_loop` does, from four angles instead of theta."""
+def _vectors(angles: Array, lengths: Array) -> tuple[LinkVectors, float]:
+    """Return the links and the inverse of the fold, as `close_loop` does from theta."""
     b, c, d = angles[1] - angles[0], angles[2] - angles[0], angles[3] - angles[0]
     l_c, l_d = lengths[2], lengths[3]
-    return (cos(b), sin(b), l_c * cos(c), l_c * sin(c), l_d * cos(d), l_d * sin(d),
+    return (LinkVectors(cos(b), sin(b), l_c * cos(c), l_c * sin(c), l_d * cos(d), l_d * sin(d)),
             1.0 / (l_c * l_d * sin(d - c)))

@@ -2,91 +2,90 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What acts on the linkage besides its motors, as generalized forces.
+Forces on the linkage besides those of its motors, as generalized forces.
 
-A new effect is one more term in `force_on_link` or `torques_on_links`: every way to solve the
-equations of motion takes its forces from these two.
+A new effect is one more term in `force_on_link` or `torques_on_links`: all forms of the equations
+of motion take their forces from these two.
 """
 
 from __future__ import annotations
 
 from math import cos, sin, sqrt
+from typing import Any, NamedTuple
 
-from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.settings import check_keys, Setting, SettingError
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.kernels.linear_algebra import Vector4
-from fourbar_ros.mechanism.constants import Array, Constants, record
-from fourbar_ros.mechanism.mechanism import numbers
+from fourbar_ros.mechanism.constants import Array, Constants, Fields, record
+from fourbar_ros.mechanism.mechanism import checked_array, JOINT_NAMES, LINK_NAMES
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+_EFFECTS = (
+    (Setting('joint_coulomb', 0.0, 'N m', 'Coulomb friction torque between the links of a joint',
+             low=0.0), JOINT_NAMES),
+    (Setting('joint_viscous', 0.0, 'N m s', 'viscous friction torque per relative rate',
+             low=0.0), JOINT_NAMES),
+    (Setting('joint_static_ratio', 1.0, '', 'static over Coulomb friction', low=1.0), ()),
+    (Setting('stribeck_rate', 0.1, 'rad/s',
+             'relative rate at which half of the excess of static friction is left', above=0.0),
+     ()),
+    (Setting('smoothing', 1e-4, 'rad/s', 'relative rate over which Coulomb friction builds up, '
+             'as rate / sqrt(rate^2 + smoothing^2)', above=0.0), ()),
+    (Setting('link_drag', 0.0, 'N s/m', 'force against the speed of the mass centre of a link',
+             low=0.0), LINK_NAMES),
+    (Setting('link_spin_drag', 0.0, 'N m s', 'torque against the rate of a link', low=0.0),
+     LINK_NAMES),
+    (Setting('gravity', 0.0, 'm/s^2', 'acceleration along the table, by its tilt'), ('x', 'y')),
+    (Setting('link_torques', 0.0, 'N m', 'constant torque on a link from outside'), LINK_NAMES),
+)
+"""The effects, and the names of their elements where there are several."""
 
-class ForceError(FourbarError):
-    """An effect that is not described by finite numbers, or that would feed energy in."""
-
-
-FIELDS: list[tuple[str, type, tuple[int, ...]]] = [
-    ('joint_coulomb', float, (4,)),     # N m
-    ('joint_viscous', float, (4,)),     # N m s
-    ('joint_static_ratio', float, ()),  # static over Coulomb friction
-    ('stribeck_rate', float, ()),       # rad/s
-    ('smoothing', float, ()),           # rad/s
-    ('link_drag', float, (4,)),         # N s/m
-    ('link_spin_drag', float, (4,)),    # N m s
-    ('gravity', float, (2,)),           # m/s^2
-    ('link_torques', float, (4,)),      # N m
-    ('acting', bool, ()),               # False: everything above is without effect
-]
+FIELDS: Fields = [
+    *((row.name, float, (len(elements),) if elements else ()) for row, elements in _EFFECTS),
+    ('acting', bool, ())]
+"""The record of the effects; where `acting` is False they are all without effect."""
 
 Surroundings = np.record
-"""Parameters of the effects, made by :func:`surroundings`; `NOTHING` where none acts."""
+"""A scalar of `FIELDS`, made by :func:`surroundings`; `NOTHING` where none acts."""
 
 
-def surroundings(
-    *, joint_coulomb: ArrayLike = 0.0, joint_viscous: ArrayLike = 0.0,
-    joint_static_ratio: float = 1.0, stribeck_rate: float = 0.1, smoothing: float = 1e-4,
-    link_drag: ArrayLike = 0.0, link_spin_drag: ArrayLike = 0.0, gravity: ArrayLike = 0.0,
-    link_torques: ArrayLike = 0.0,
-) -> Surroundings:
+class System(NamedTuple):
+    """The linkage and its surroundings, for kernels."""
+
+    constants: Constants
+    around: Surroundings
+
+
+class Losses(NamedTuple):
     """
-    Describe what acts besides the motors; what is left out does not act.
+    The losses of the links.
 
-    A single number stands for all four joints or links.
-
-    :param joint_coulomb: (4,) friction torque between the two links of joints 1 to 4 [N m].
-    :param joint_viscous: (4,) friction torque per relative rate in the joints [N m s].
-    :param joint_static_ratio: how much more than Coulomb friction it takes to break away.
-    :param stribeck_rate: relative rate at which half of that is left [rad/s].
-    :param smoothing: relative rate [rad/s] around which Coulomb friction builds up, as
-        `rate / sqrt(rate^2 + smoothing^2)`.
-    :param link_drag: (4,) force against the speed of each link's mass centre [N s/m].
-    :param link_spin_drag: (4,) torque against the rate of each link [N m s].
-    :param gravity: (2,) acceleration along the table, as by its tilt, x and y [m/s^2].
-    :param link_torques: (4,) constant torques on the links from outside [N m].
-    :raises ForceError: wrong shape, not finite, or a negative friction or drag.
+    :ivar joint_power: lost in the joints [W].
+    :ivar drag_power: lost to drag [W].
+    :ivar drag_torque: torque of the drag about the mass centre [N m].
     """
-    given = {
-        'joint_coulomb': (joint_coulomb, 4), 'joint_viscous': (joint_viscous, 4),
-        'link_drag': (link_drag, 4), 'link_spin_drag': (link_spin_drag, 4),
-        'gravity': (gravity, 2), 'link_torques': (link_torques, 4)}
-    values = {}
-    for name, (value, size) in given.items():
-        array = numbers(name, value, ForceError)
-        if array.shape not in ((), (size,)):
-            raise ForceError(f'{name} must be one number or {size}, got shape {array.shape}')
-        values[name] = array = np.broadcast_to(array, (size,)).copy()
-        if not np.isfinite(array).all():
-            raise ForceError(f'{name} must be finite, got {array[~np.isfinite(array)][0]}')
-        if name not in ('gravity', 'link_torques') and (array < 0.0).any():
-            raise ForceError(f'{name} must not be negative, got {array.min():g}')
-    for name, rate in (('smoothing', smoothing), ('stribeck_rate', stribeck_rate)):
-        if not 0.0 < rate < np.inf:
-            raise ForceError(f'{name} must be a positive rate in rad/s, got {rate:g}')
-    if not 1.0 <= joint_static_ratio < np.inf:
-        raise ForceError(f'joint_static_ratio must be at least 1, got {joint_static_ratio:g}')
-    acting = any(array.any() for array in values.values())
-    return record(FIELDS, acting=acting, smoothing=smoothing, stribeck_rate=stribeck_rate,
-                  joint_static_ratio=joint_static_ratio, **values)
+
+    joint_power: float
+    drag_power: float
+    drag_torque: float
+
+
+def surroundings(**effects: ArrayLike) -> Surroundings:
+    """
+    Describe the forces besides those of the motors; an effect that is not named does not act.
+
+    :param effects: by the names in `FIELDS`. A single number stands for all joints or links.
+    :raises SettingError: unknown name, wrong shape, not finite, or a negative friction or drag.
+    """
+    check_keys(effects, (), 'surroundings', SettingError, [row.name for row, _ in _EFFECTS])
+    values: dict[str, Any] = {}
+    for row, elements in _EFFECTS:
+        value = effects.get(row.name, row.default)
+        values[row.name] = (checked_array(row, value, elements) if np.ndim(value)
+                            else row.check(value))
+    acting = any(np.any(values[row.name]) for row, elements in _EFFECTS if elements)
+    return record(FIELDS, acting=acting, **values)
 
 
 NOTHING = surroundings()
@@ -125,17 +124,18 @@ def torques_on_links(rates: Vector4, around: Surroundings) -> Vector4:
 @kernel
 def _joint_torque(joint: int, rate: float, around: Surroundings) -> float:
     """Evaluate the friction on the link whose rate counts as positive."""
-    return float(-rate * (around.joint_viscous[joint] + around.joint_coulomb[joint] * grip(
+    return float(-rate * (around.joint_viscous[joint] + around.joint_coulomb[joint] * dry_friction(
         rate, around.joint_static_ratio, around.stribeck_rate, around.smoothing)))
 
 
 @kernel
-def grip(rate: float, static_ratio: float, stribeck_rate: float, smoothing: float) -> float:
+def dry_friction(rate: float, static_ratio: float, stribeck_rate: float, smoothing: float
+                 ) -> float:
     """
-    Evaluate dry friction over Coulomb friction and rate, a function of the rate alone [s/rad].
+    Evaluate dry friction divided by Coulomb friction and rate, a function of the rate [s/rad].
 
-    It falls from static to Coulomb friction as Hess and Soom have it (J. Tribology 112, 1990,
-    p. 147), and rises from rest over `smoothing`, so that there is nothing to jump about.
+    The friction falls from static to Coulomb friction by the law of Hess and Soom (J. Tribology
+    112, 1990, p. 147). It rises from rest over the rate `smoothing`, without a jump.
     """
     ratio = rate / stribeck_rate
     return float((1.0 + (static_ratio - 1.0) / (1.0 + ratio * ratio))
@@ -145,22 +145,23 @@ def grip(rate: float, static_ratio: float, stribeck_rate: float, smoothing: floa
 @kernel
 def generalized_forces(
     cosines: Vector4, sines: Vector4, rates: Vector4, velocity: tuple[float, float],
-    constants: Constants, around: Surroundings,
+    system: System,
 ) -> tuple[Vector4, tuple[float, float]]:
     """
-    Sum up all effects as generalized forces on the four link angles and the mass centre.
+    Sum all effects as generalized forces on the four link angles and the mass centre.
 
     :param cosines, sines: of the four link angles.
     :param rates: of the links [rad/s].
     :param velocity: of the mass centre of the whole [m/s].
-    :returns: on the link angles [N m], the mass centre staying where it is; and the force on the
-        mass centre, in the table frame [N].
+    :returns: on the link angles with the mass centre fixed [N m], and the force on the mass
+        centre, in the table frame [N].
     """
+    constants, around = system.constants, system.around
     rate_a, rate_b, rate_c, rate_d = rates
     qa, qb, qc, qd = torques_on_links(rates, around)
     total_x = total_y = 0.0
     for i in range(4):
-        # Where the mass centre of link i goes when one link turns: E R(phi_j) arms[i, j].
+        # Velocity of the mass centre of link i per rate of each link: E R(phi_j) arms[i, j].
         ax, ay = _lever(cosines[0], sines[0], constants.arms[i, 0])
         bx, by = _lever(cosines[1], sines[1], constants.arms[i, 1])
         cx, cy = _lever(cosines[2], sines[2], constants.arms[i, 2])
@@ -185,19 +186,18 @@ def forces_along(angles: Array, rates: Array, constants: NDArray[np.record],
     Evaluate the generalized forces on the link angles along a motion, the mass centre at rest.
 
     :param angles, rates: (n, 4) of the links [rad], [rad/s].
-    :param constants, around: (1,) of the mechanism, and of what surrounds it.
+    :param constants, around: (1,) of the mechanism and of its surroundings.
     :returns: (n, 4) [N m].
     """
-    found = np.empty((len(angles), 4))
+    forces, system = np.empty((len(angles), 4)), System(constants[0], around[0])
     for n in range(len(angles)):
         a, b, c, d = angles[n]
         on_links, _ = generalized_forces(
             (cos(a), cos(b), cos(c), cos(d)), (sin(a), sin(b), sin(c), sin(d)),
-            (rates[n, 0], rates[n, 1], rates[n, 2], rates[n, 3]), (0.0, 0.0), constants[0],
-            around[0])
+            (rates[n, 0], rates[n, 1], rates[n, 2], rates[n, 3]), (0.0, 0.0), system)
         for link in range(4):
-            found[n, link] = on_links[link]
-    return found
+            forces[n, link] = on_links[link]
+    return forces
 
 
 @kernel
@@ -207,49 +207,42 @@ def _lever(cosine: float, sine: float, arm: Array) -> tuple[float, float]:
 
 @kernel
 def losses(cosines: Vector4, sines: Vector4, rates: Vector4, velocity: tuple[float, float],
-           constants: Constants, around: Surroundings
-           ) -> tuple[float, float, float]:
+           system: System) -> Losses:
     """
-    Evaluate what friction and drag take from the links.
+    Evaluate the losses of rigid links.
 
     Parameters as of :func:`generalized_forces`.
-
-    :returns: power lost in the joints and to drag [W], and torque of the drag about the mass
-        centre [N m].
     """
-    in_joints = lost_in_joints(rates, around)
-    to_drag = torque = 0.0
+    constants, around = system.constants, system.around
+    drag_power = drag_torque = 0.0
     for i in range(4):
-        to_drag += around.link_spin_drag[i] * rates[i] * rates[i]
-        torque -= around.link_spin_drag[i] * rates[i]
+        drag_power += around.link_spin_drag[i] * rates[i] * rates[i]
+        drag_torque -= around.link_spin_drag[i] * rates[i]
         drag = around.link_drag[i]
         if drag > 0.0:
-            x, y, speed_x, speed_y = _place(i, cosines, sines, rates, constants)
+            x = y = speed_x = speed_y = 0.0
+            for j in range(4):
+                dx, dy = rotated(cosines[j], sines[j], constants.arms[i, j])
+                x, y = x + dx, y + dy
+                speed_x, speed_y = speed_x - rates[j] * dy, speed_y + rates[j] * dx
             speed_x, speed_y = speed_x + velocity[0], speed_y + velocity[1]
-            to_drag += drag * (speed_x * speed_x + speed_y * speed_y)
-            torque -= drag * (x * speed_y - y * speed_x)
-    return in_joints, to_drag, torque
+            drag_power += drag * (speed_x * speed_x + speed_y * speed_y)
+            drag_torque -= drag * (x * speed_y - y * speed_x)
+    return Losses(joint_power(rates, around), drag_power, drag_torque)
 
 
 @kernel
-def lost_in_joints(rates: Vector4, around: Surroundings) -> float:
-    """Evaluate the power that friction in the joints takes at the links' rates [W]."""
+def rotated(cosine: float, sine: float, vector: Array) -> tuple[float, float]:
+    """Return x and y of a vector (2,) after a rotation."""
+    return cosine * vector[0] - sine * vector[1], sine * vector[0] + cosine * vector[1]
+
+
+@kernel
+def joint_power(rates: Vector4, around: Surroundings) -> float:
+    """Evaluate the power that friction in the joints takes at the rates of the links [W]."""
     rate_a, rate_b, rate_c, rate_d = rates
     relative = (rate_b - rate_a, rate_c - rate_b, rate_c - rate_d, rate_d - rate_a)
     lost = 0.0
     for joint in range(4):
         lost -= _joint_torque(joint, relative[joint], around) * relative[joint]
     return lost
-
-
-@kernel
-def _place(link: int, cosines: Vector4, sines: Vector4, rates: Vector4, constants: Constants
-           ) -> tuple[float, float, float, float]:
-    """Return where the mass centre of a link is [m], and its velocity [m/s], from the whole's."""
-    x = y = speed_x = speed_y = 0.0
-    for j in range(4):
-        arm = constants.arms[link, j]
-        dx, dy = cosines[j] * arm[0] - sines[j] * arm[1], sines[j] * arm[0] + cosines[j] * arm[1]
-        x, y = x + dx, y + dy
-        speed_x, speed_y = speed_x - rates[j] * dy, speed_y + rates[j] * dx
-    return x, y, speed_x, speed_y

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Integration of the motion: one fixed Runge-Kutta step of order four, and loops around it.
+Integration of the motion: one step of the state, in the form that fits it, and loops around it.
 
-The state is a vector as mechanism.layout describes it.
+The state is the vector of `mechanism.state`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from math import ceil, cos, pi, sin
 from threading import Lock
 from typing import Any
 
+from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.kernels.compiler import kernel, prange
+from fourbar_ros.kernels.runge_kutta import Drive
 from fourbar_ros.mechanism.change_points import REDUCED_FORM_LIMIT
 from fourbar_ros.mechanism.compliant import advance_compliant
 from fourbar_ros.mechanism.constants import Array, Constants
@@ -21,54 +23,63 @@ from fourbar_ros.mechanism.constrained import (
     advance_constrained,
     constrained_accelerations,
     directions,
+    LinkMotion,
 )
-from fourbar_ros.mechanism.forces import Surroundings
+from fourbar_ros.mechanism.forces import Surroundings, System
 from fourbar_ros.mechanism.reduced import (
     advance_reduced,
     reduced_accelerations,
+    ReducedMotion,
     side_of_joint_3,
 )
 from fourbar_ros.mechanism.state import (
+    ANGLE,
+    angles_of,
     CENTRE_X,
     CENTRE_Y,
+    GAP,
+    RATE,
+    rates_of,
     STATE_SIZE,
     VELOCITY_X,
     VELOCITY_Y,
+    WHEEL_ANGLE,
+    WHEEL_SPEED,
 )
 import numpy as np
 from numpy.typing import NDArray
 
 
+class BatchError(FourbarError):
+    """Arrays of a batch that do not fit together."""
+
+
 @kernel
-def advance_state(state: Array, start: Array, middle: Array, end: Array, step: float,
-                  constants: Constants, around: Surroundings) -> None:
+def advance_state(state: Array, drive: Drive, step: float, system: System) -> None:
     """
     Advance the state by one Runge-Kutta step of order four, in place, the loop staying closed.
 
     :param state: (STATE_SIZE,).
-    :param start, middle, end: (4,) what drives the wheels at the begin, middle and end of the
-        step; three times the same array for a zero-order hold. The motor torque on the wheel, or
-        its axial inertia times its acceleration relative to the link where that is prescribed
-        [N m].
+    :param drive: of the wheels; three times the same torques for a zero-order hold.
     :param step: [s].
     """
-    a, b, c, d = state[0], state[1], state[2], state[3]
-    rate_a, rate_b, rate_c, rate_d = state[4], state[5], state[6], state[7]
+    constants = system.constants
+    angles, rates = angles_of(state), rates_of(state)
     if constants.compliant:
-        advance_compliant(state, start, middle, end, step, constants, around)
-    elif not advance_reduced(state, start, middle, end, step, constants, around):
-        advance_constrained(state, start, middle, end, step, constants, around, True)
-    turned = (state[0] - a, state[1] - b, state[2] - c, state[3] - d)
-    rates = (rate_a, rate_b, rate_c, rate_d)
+        advance_compliant(state, drive, step, system)
+    elif not advance_reduced(state, drive, step, system):
+        advance_constrained(state, drive, step, system, True)
+    start, middle, end = drive
     for j in range(4):
         inertia, prescribed = constants.flywheel_inertias[j], constants.prescribed[j]
-        # The wheel's own motion: seen from the link if prescribed, from the table if not.
-        speed = state[12 + j] - prescribed * rates[j]
-        state[8 + j] += (step * (speed + step / 6.0 * (start[j] + 2.0 * middle[j]) / inertia)
-                         - (1.0 - prescribed) * turned[j])
-        state[12 + j] = (
+        # The wheel's own motion: relative to the link if prescribed, to the table if not.
+        speed = state[WHEEL_SPEED + j] - prescribed * rates[j]
+        state[WHEEL_ANGLE + j] += (
+            step * (speed + step / 6.0 * (start[j] + 2.0 * middle[j]) / inertia)
+            - (1.0 - prescribed) * (state[ANGLE + j] - angles[j]))
+        state[WHEEL_SPEED + j] = (
             speed + step / 6.0 * (start[j] + 4.0 * middle[j] + end[j]) / inertia
-            + prescribed * state[4 + j])
+            + prescribed * state[RATE + j])
 
 
 @kernel
@@ -81,23 +92,26 @@ def evaluate(state: Array, torques: Array, constants: Constants, around: Surroun
     :param torques: (4,) as in :func:`advance_state`.
     :param out: (STATE_SIZE,) receives d(state)/dt.
     """
-    theta, vx, vy = state[1] - state[0], state[VELOCITY_X], state[VELOCITY_Y]
-    a, b, c, d, ax, ay, _, _, fold = reduced_accelerations(
-        state[0], cos(theta), sin(theta), side_of_joint_3(state[2], state[3]),
-        state[4], state[5], vx, vy, torques, constants, around)
-    if not fold > REDUCED_FORM_LIMIT * constants.lengths[2] * constants.lengths[3]:
-        cosines, sines = directions((state[0], state[1], state[2], state[3]))
-        (a, b, c, d), (ax, ay), _ = constrained_accelerations(
-            state[0], cosines, sines, (state[4], state[5], state[6], state[7]), (vx, vy),
-            torques, constants, around, True)
-    out[4], out[5], out[6], out[7] = a, b, c, d
+    system = System(constants, around)
+    theta, velocity = state[ANGLE + 1] - state[ANGLE], (state[VELOCITY_X], state[VELOCITY_Y])
+    reduced = reduced_accelerations(ReducedMotion(
+        state[ANGLE], cos(theta), sin(theta), side_of_joint_3(state[ANGLE + 2], state[ANGLE + 3]),
+        state[RATE], state[RATE + 1], velocity), torques, system)
+    accelerations, centre = reduced.accelerations, reduced.centre
+    if not reduced.fold > REDUCED_FORM_LIMIT * constants.lengths[2] * constants.lengths[3]:
+        cosines, sines = directions(angles_of(state))
+        constrained = constrained_accelerations(LinkMotion(
+            state[ANGLE], cosines, sines, rates_of(state), velocity), torques, system, True)
+        accelerations, centre = constrained.accelerations, constrained.centre
     for j in range(4):
-        out[j] = state[4 + j]
-        out[8 + j] = state[12 + j] - state[4 + j]
-        out[12 + j] = (torques[j] / constants.flywheel_inertias[j]
-                       + constants.prescribed[j] * out[4 + j])
-    out[CENTRE_X], out[CENTRE_Y], out[VELOCITY_X], out[VELOCITY_Y] = vx, vy, ax, ay
-    out[20:] = 0.0
+        out[ANGLE + j] = state[RATE + j]
+        out[RATE + j] = accelerations[j]
+        out[WHEEL_ANGLE + j] = state[WHEEL_SPEED + j] - state[RATE + j]
+        out[WHEEL_SPEED + j] = (torques[j] / constants.flywheel_inertias[j]
+                                + constants.prescribed[j] * out[RATE + j])
+    out[CENTRE_X], out[CENTRE_Y] = velocity
+    out[VELOCITY_X], out[VELOCITY_Y] = centre
+    out[GAP:] = 0.0
 
 
 @kernel
@@ -108,8 +122,9 @@ def move_held(state: Array, torques: Array, step: float, steps: int, constants: 
 
     Parameters as of :func:`advance_state`.
     """
+    drive, system = Drive(torques, torques, torques), System(constants, around)
     for _ in range(steps):
-        advance_state(state, torques, torques, torques, step, constants, around)
+        advance_state(state, drive, step, system)
 
 
 @kernel
@@ -120,8 +135,8 @@ def move_with_cosines(
     """
     Integrate under motor torques `amplitude cos(2 pi frequency t + phase)`.
 
-    A wheel whose motion is prescribed has that for its angle relative to the link instead, up to
-    a constant; its speed in the state must fit.
+    For a wheel whose motion is prescribed this is its angle relative to the link instead, up to a
+    constant; its speed in the state must agree.
 
     :param state: (STATE_SIZE,) at times[0]; not changed.
     :param times: (n,) increasing [s].
@@ -130,9 +145,10 @@ def move_with_cosines(
         is divided into equal steps.
     :returns: (n, STATE_SIZE) the state at every time.
     """
-    out = np.empty((times.size, STATE_SIZE))
+    out, system = np.empty((times.size, STATE_SIZE)), System(constants, around)
     now = state.copy()
-    drive = np.empty((3, 4))
+    torques = np.empty((3, 4))
+    drive = Drive(torques[0], torques[1], torques[2])
     size, omega = np.empty(4), 2.0 * pi * frequency
     for j in range(4):
         size[j] = amplitude[j]
@@ -147,8 +163,8 @@ def move_with_cosines(
             for stage in range(3):
                 t = times[n - 1] + (i + 0.5 * stage) * step
                 for j in range(4):
-                    drive[stage, j] = size[j] * cos(omega[j] * t + phase[j])
-            advance_state(now, drive[0], drive[1], drive[2], step, constants, around)
+                    torques[stage, j] = size[j] * cos(omega[j] * t + phase[j])
+            advance_state(now, drive, step, system)
         out[n] = now
     return out
 
@@ -164,22 +180,24 @@ def move_batch(states: Array, torques: Array, step: float, steps: int,
     :param torques: (n, 4) [N m].
     :param step: [s].
     :param constants, around: one for all states, or arrays of n of them.
-    :raises ValueError: the numbers of states, torques, constants and surroundings do not fit, or
-        the states lie in memory in another way, for which all would be compiled anew.
+    :raises BatchError: the counts of states, torques, constants and surroundings do not agree, or
+        states of another memory layout, for which all would be compiled anew.
     """
     if states.dtype != np.float64 or not (states.flags.c_contiguous and states.flags.writeable):
-        raise ValueError(
+        raise BatchError(
             f'states must be contiguous, writeable and of float64, got {states.dtype}, '
-            f'contiguous: {states.flags.c_contiguous}, writeable: {states.flags.writeable}')
+            f'contiguous: {states.flags.c_contiguous}, writeable: {states.flags.writeable}',
+            name='states', value=states.dtype)
     torques = np.ascontiguousarray(torques, dtype=float)
     count = len(states)
-    each, surrounding = (np.ascontiguousarray(np.atleast_1d(given))
-                         for given in (constants, around))
+    each, surrounding = (np.ascontiguousarray(np.atleast_1d(records))
+                         for records in (constants, around))
     if (states.shape != (count, STATE_SIZE) or torques.shape != (count, 4)
             or len(each) not in (1, count) or len(surrounding) not in (1, count)):
-        raise ValueError(
+        raise BatchError(
             f'{states.shape} states need (n, {STATE_SIZE}); (n, 4) torques, got {torques.shape}; '
-            f'1 or n constants and surroundings, got {len(each)} and {len(surrounding)}')
+            f'1 or n constants and surroundings, got {len(each)} and {len(surrounding)}',
+            value=(states.shape, torques.shape, len(each), len(surrounding)))
     with _one_batch:
         _move_batch(states, torques, step, steps, each, surrounding)
 
@@ -196,3 +214,34 @@ def _move_batch(states: Array, torques: Array, step: float, steps: int,
         n = np.int64(index)
         move_held(states[n], torques[n], step, steps, constants[min(n, last_constants)],
                   around[min(n, last_around)])
+
+
+@kernel(parallel=True)
+def link_trajectories(states: Array, torques: Array, sequence: NDArray[np.int64], factors: Array,
+                      step: float, steps: int, constants: NDArray[Any], around: NDArray[Any]
+                      ) -> Array:
+    """
+    Integrate many motions on all cores, and return their links at every tick.
+
+    Not for two threads at once.
+
+    :param states: (n, STATE_SIZE) at the start; changed in place.
+    :param torques: (k, m, 4) k sequences of motor torques, held for a tick each, over the factors.
+    :param sequence: (n,) index of the sequence of each motion.
+    :param factors: (n, 4) of the torques of each motion.
+    :param step: [s].
+    :param steps: in a tick.
+    :param constants, around: (n,) of each motion.
+    :returns: (m + 1, n, 8) link angles [rad] and rates [rad/s].
+    """
+    trajectories = np.empty((torques.shape[1] + 1, len(states), WHEEL_ANGLE))
+    for index in prange(states.shape[0]):
+        n = np.int64(index)
+        state, held = states[n], np.empty(4)
+        trajectories[0, n] = state[:WHEEL_ANGLE]
+        for tick in range(torques.shape[1]):
+            for wheel in range(4):
+                held[wheel] = factors[n, wheel] * torques[sequence[n], tick, wheel]
+            move_held(state, held, step, steps, constants[n], around[n])
+            trajectories[tick + 1, n] = state[:WHEEL_ANGLE]
+    return trajectories

@@ -5,14 +5,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, MISSING, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, MISSING, replace
 from functools import cached_property
+from math import inf
 from typing import Any
 
 from fourbar_ros.common.config_files import config_file, load_yaml
-from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.common.settings import check_keys
+from fourbar_ros.common.settings import (
+    Setting,
+    setting,
+    SettingError,
+    Settings,
+    settings_of,
+)
 from fourbar_ros.mechanism.change_points import LENGTH_ROUNDING, MATCHING_LENGTHS
 from fourbar_ros.mechanism.constants import Array, Constants, constants_of
 import numpy as np
@@ -22,79 +28,79 @@ LINK_NAMES = ('link_a', 'link_b', 'link_c', 'link_d')
 FLYWHEEL_NAMES = ('flywheel_a', 'flywheel_b', 'flywheel_c', 'flywheel_d')
 JOINT_NAMES = ('joint_1', 'joint_2', 'joint_3', 'joint_4')
 
-# What may be measured: orientations of links, and angles in joints.
 SENSOR_NAMES = (*LINK_NAMES, *JOINT_NAMES)
+"""Names of all possible sensors: of the orientation of a link, or of the angle in a joint."""
 
-# First and second link of each joint; an encoder there measures the second relative to the first.
 JOINT_LINKS = ((0, 1), (1, 2), (2, 3), (3, 0))
+"""First and second link of each joint; its encoder measures the second relative to the first."""
 
-# Which links line up against the others at a change point: a and d against b and c (parallelogram,
-# theta = 0), a and b against c and d (theta = pi), a and c against b and d.
-ALIGNMENTS = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
-
-# Least values of those that need not be positive.
-LOWEST = {'com_positions': -np.inf, 'link_angle_offsets': -np.inf, 'joint_damping': 0.0,
-          'motor_time_constants': 0.0, 'motor_resistances': 0.0}
+_ALIGNMENTS = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
+"""
+Signs of the links that line up against the others at a change point: a and d against b and c
+(parallelogram, theta = 0), a and b against c and d (theta = pi), a and c against b and d.
+"""
 
 
-class MechanismError(FourbarError):
+class MechanismError(SettingError):
     """A mechanism that cannot exist or is not fully described."""
 
 
+def _per_link(unit: str, meaning: str, default: float | None = None, **limits: Any) -> Any:
+    """Declare a field of one value for each link or joint; without a default it is required."""
+    value = MISSING if default is None else (default,) * 4
+    return setting(value, unit, meaning, kind=float, **limits)
+
+
 @dataclass(frozen=True, eq=False)
-class Mechanism:
+class Mechanism(Settings):
     """
     A closed loop of four rigid links, one flywheel on each (order a, b, c, d; SI units).
 
-    Lengths that miss a change point, where all links lie on a line, by less than
-    `MATCHING_LENGTHS` are made to meet it.
+    Fields are arrays (4,), in the order of the links or of joints 1 to 4; `com_positions` is
+    (4, 2). Lengths that miss a change point by less than `MATCHING_LENGTHS` are changed to meet
+    it.
 
-    :param link_lengths: (4,) distance between the two joints of each link [m].
-    :param link_masses: (4,) mass of each link with its flywheel [kg].
-    :param link_inertias: (4,) about the link's own mass centre, the wheel's mass counted in it,
-        without the wheel's axial inertia [kg m^2].
-    :param com_positions: (4, 2) mass centre of each link in its link frame [m].
-    :param flywheel_inertias: (4,) axial inertia of each wheel [kg m^2].
-    :param motor_torque_limits: (4,) largest torque of each motor [N m], default unlimited.
-    :param motor_speed_limits: (4,) largest wheel speed relative to the link [rad/s], default
-        unlimited.
-    :param motor_time_constants: (4,) with which the torque follows what is asked for [s],
-        default 0.
-    :param motor_torque_constants: (4,) torque per current, and voltage per speed [N m/A, V s/rad],
-        default infinite: no current flows.
-    :param motor_resistances: (4,) of the windings [ohm], default 0.
-    :param motor_voltages: (4,) of the supply [V], default unlimited.
-    :param joint_stiffness: (4,) how hard the two ends in joints 1 to 4 are pulled together [N/m],
-        default infinite: rigid. Either all four joints are rigid or none.
-    :param joint_damping: (4,) of the same, for joints that are not rigid [N s/m], default 0.
-    :param link_angle_offsets: (4,) what the sensors of the links read beyond the orientation of
-        their links [rad], default 0. A real device takes it out of `link_angles`; a simulated one
-        has nothing to take out.
-    :raises MechanismError: wrong shape, not finite, not positive, lengths that cannot close, or
-        joints of which only some are rigid.
+    :raises SettingError: wrong shape, not finite, or out of range.
+    :raises MechanismError: lengths that cannot close, joints of which only some are rigid, or
+        windings that are described in part.
     """
 
-    link_lengths: Array
-    link_masses: Array
-    link_inertias: Array
-    com_positions: Array
-    flywheel_inertias: Array
-    motor_torque_limits: Array = field(default_factory=lambda: np.full(4, np.inf))
-    motor_speed_limits: Array = field(default_factory=lambda: np.full(4, np.inf))
-    motor_time_constants: Array = field(default_factory=lambda: np.zeros(4))
-    motor_torque_constants: Array = field(default_factory=lambda: np.full(4, np.inf))
-    motor_resistances: Array = field(default_factory=lambda: np.zeros(4))
-    motor_voltages: Array = field(default_factory=lambda: np.full(4, np.inf))
-    joint_stiffness: Array = field(default_factory=lambda: np.full(4, np.inf))
-    joint_damping: Array = field(default_factory=lambda: np.zeros(4))
-    link_angle_offsets: Array = field(default_factory=lambda: np.zeros(4))
+    section = 'mechanism'
+
+    link_lengths: Array = _per_link('m', 'distance between the two joints of the link', above=0.0)
+    link_masses: Array = _per_link('kg', 'mass of the link with its flywheel', above=0.0)
+    link_inertias: Array = _per_link(
+        'kg m^2', "inertia about the link's own mass centre, with the mass of the wheel and "
+        'without its axial inertia', above=0.0)
+    com_positions: Array = _per_link('m', 'mass centre of the link in its link frame, x and y')
+    flywheel_inertias: Array = _per_link('kg m^2', 'axial inertia of the wheel', above=0.0)
+    motor_torque_limits: Array = _per_link(
+        'N m', 'largest torque of the motor', inf, above=0.0, infinite=True)
+    motor_speed_limits: Array = _per_link(
+        'rad/s', 'largest wheel speed relative to the link', inf, above=0.0, infinite=True)
+    motor_time_constants: Array = _per_link(
+        's', 'time constant with which the torque follows its command', 0.0, low=0.0)
+    motor_torque_constants: Array = _per_link(
+        'N m/A', 'torque per current, and voltage per speed; infinite: no current flows', inf,
+        above=0.0, infinite=True)
+    motor_resistances: Array = _per_link('ohm', 'resistance of the windings', 0.0, low=0.0)
+    motor_voltages: Array = _per_link('V', 'supply voltage', inf, above=0.0, infinite=True)
+    joint_stiffness: Array = _per_link(
+        'N/m', 'stiffness of the joint against a gap; infinite: rigid. All joints are rigid or '
+        'none', inf, above=0.0, infinite=True)
+    joint_damping: Array = _per_link('N s/m', 'damping of a compliant joint', 0.0, low=0.0)
+    link_angle_offsets: Array = _per_link(
+        'rad', 'reading of the sensor of the link less the orientation of the link. A real device '
+        'subtracts it from `link_angles`; a simulated one has none', 0.0)
 
     def __post_init__(self) -> None:
         """Check every value and make every array read-only."""
-        for item in fields(self):
-            shape = (4, 2) if item.name == 'com_positions' else (4,)
-            array = _checked_array(item.name, getattr(self, item.name), shape)
-            object.__setattr__(self, item.name, array)
+        for row in settings_of(type(self)):
+            elements = JOINT_NAMES if row.name.startswith('joint_') else LINK_NAMES
+            array = checked_array(row, getattr(self, row.name), elements,
+                                  ('x', 'y') if row.name == 'com_positions' else ())
+            array.flags.writeable = False
+            object.__setattr__(self, row.name, array)
         self._check_that_it_closes()
         self._match_lengths()
         self._check_joints()
@@ -102,42 +108,49 @@ class Mechanism:
 
     def _check_that_it_closes(self) -> None:
         longest = int(np.argmax(self.link_lengths))
+        length = float(self.link_lengths[longest])
         others = float(np.sum(np.delete(self.link_lengths, longest)))
-        if self.link_lengths[longest] >= others:
+        if length >= others:
             raise MechanismError(
-                f'link_lengths cannot close: {LINK_NAMES[longest]} is '
-                f'{self.link_lengths[longest]:g} m long, the other three reach {others:g} m')
+                f'link_lengths cannot close: {LINK_NAMES[longest]} is {length:g} m long, the '
+                f'other three reach {others:g} m',
+                name=f'link_lengths.{LINK_NAMES[longest]}', value=length, limit=others)
 
     def _match_lengths(self) -> None:
-        missing = ALIGNMENTS @ self.link_lengths
+        missing = _ALIGNMENTS @ self.link_lengths
         relative = np.abs(missing) / self.link_lengths.mean()
         missing[(relative < LENGTH_ROUNDING) | (relative >= MATCHING_LENGTHS)] = 0.0
-        matched = self.link_lengths - missing / 4.0 @ ALIGNMENTS
+        matched = self.link_lengths - missing / 4.0 @ _ALIGNMENTS
         matched.flags.writeable = False
         object.__setattr__(self, 'link_lengths', matched)
 
     def _check_joints(self) -> None:
         rigid = np.isinf(self.joint_stiffness)
         if rigid.any() and not rigid.all():
+            first, other = (JOINT_NAMES[int(place(rigid))] for place in (np.argmax, np.argmin))
             raise MechanismError(
-                f'joint_stiffness of joint {int(np.argmax(rigid)) + 1} is infinite and that of '
-                f'joint {int(np.argmin(rigid)) + 1} is not: give all four, or none')
+                f'joint_stiffness of {first} is infinite and that of {other} is not: make all '
+                'four finite, or none', name=f'joint_stiffness.{first}', value=inf)
         if rigid.all() and self.joint_damping.any():
+            damped = JOINT_NAMES[int(np.argmax(self.joint_damping))]
             raise MechanismError(
-                f'joint_damping of joint {int(np.argmax(self.joint_damping)) + 1} is given, but '
-                'the joints are rigid: give joint_stiffness too')
+                f'joint_damping of {damped} needs a finite joint_stiffness: the joints are rigid',
+                name=f'joint_damping.{damped}', missing='joint_stiffness')
 
     def _check_windings(self) -> None:
-        for wheel, name in enumerate(LINK_NAMES):
-            constant, resistance, voltage = (float(given[wheel]) for given in (
+        for wheel, link in enumerate(LINK_NAMES):
+            constant, resistance, voltage = (float(values[wheel]) for values in (
                 self.motor_torque_constants, self.motor_resistances, self.motor_voltages))
-            if np.isinf(constant) and (resistance > 0.0 or np.isfinite(voltage)):
-                raise MechanismError(
-                    f'motor_resistances or motor_voltages of {name} is given: give '
-                    'motor_torque_constants too')
-            if np.isfinite(voltage) and resistance == 0.0:
-                raise MechanismError(
-                    f'motor_voltages of {name} is given: give motor_resistances too')
+            limited = np.isfinite(voltage)
+            if np.isinf(constant) and (resistance > 0.0 or limited):
+                name = 'motor_voltages' if limited else 'motor_resistances'
+                missing = 'motor_torque_constants'
+            elif limited and resistance == 0.0:
+                name, missing = 'motor_voltages', 'motor_resistances'
+            else:
+                continue
+            raise MechanismError(f'{name} of {link} needs {missing} too',
+                                 name=f'{name}.{link}', missing=missing)
 
     def with_rigid_joints(self) -> Mechanism:
         """Return the same linkage without compliance."""
@@ -146,33 +159,29 @@ class Mechanism:
 
     @cached_property
     def constants(self) -> Constants:
-        """Work out what the kernels need, all wheels being driven by torques."""
+        """Constants of the kernels, all wheels being driven by torques."""
         return self.constants_with(np.zeros(4, dtype=bool))
 
     def constants_with(self, prescribed: Array) -> Constants:
         """
-        Work out the same where the motion of some wheels is prescribed instead.
+        Evaluate the constants of the kernels where the motion of some wheels is prescribed.
 
-        :param prescribed: (4,) bool, the wheels whose angle relative to the link is given.
+        :param prescribed: (4,) bool, the wheels with a prescribed angle relative to the link.
         """
         return constants_of(self, np.asarray(prescribed, dtype=bool))
 
     @classmethod
-    def from_mapping(cls, values: Mapping[str, Any], origin: str) -> Mechanism:
+    def from_mapping(cls, values: Any, place: str = '') -> Mechanism:
         """
-        Make a mechanism from the keys of a mechanism file.
+        Make a mechanism from the keys of a mechanism file, the names of the fields.
 
-        :param values: the keys are the names of this class's fields.
-        :param origin: where the values come from, for messages.
+        :param place: origin of the values, for messages.
         :raises MechanismError: a key is missing or unknown, or a value is refused.
         """
-        names = {item.name for item in fields(cls)}
-        optional = {item.name for item in fields(cls) if item.default_factory is not MISSING}
-        check_keys(values, names - optional, origin, MechanismError, optional=optional)
         try:
-            return cls(**values)
-        except MechanismError as error:
-            raise MechanismError(f'{origin}: {error}') from None
+            return super().from_mapping(values)
+        except SettingError as error:
+            raise error.at(place, MechanismError) from None
 
 
 def load_mechanism(name: str) -> Mechanism:
@@ -187,35 +196,13 @@ def load_mechanism(name: str) -> Mechanism:
     return Mechanism.from_mapping(load_yaml(path), str(path))
 
 
-def numbers(name: str, value: ArrayLike, error: type[FourbarError]) -> Array:
+def checked_array(row: Setting, values: ArrayLike, elements: Sequence[str],
+                  inner: Sequence[str] = ()) -> Array:
     """
-    Make a new array of numbers, and of nothing that merely looks like them.
+    Return the values of a setting as a new array.
 
-    :param name: what it is, for the message.
-    :param error: what to raise.
+    :param elements, inner: names of its elements, as of `Setting.check_each`.
+    :raises SettingError: wrong shape, or an element is refused.
     """
-    try:
-        given = np.asarray(value)
-    except ValueError:      # rows of different lengths
-        given = np.asarray(None)
-    if given.dtype.kind not in 'iuf':
-        raise error(f'{name} must hold numbers, got {value!r}')
-    return np.array(given, dtype=float)
-
-
-def _checked_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = numbers(name, value, MechanismError)
-    if array.shape != shape:
-        raise MechanismError(f'{name} must have shape {shape}, got {array.shape}')
-    lowest = LOWEST.get(name)
-    unlimited = name.startswith(('motor_', 'joint_')) and lowest is None
-    for index, number in np.ndenumerate(array):
-        place = f'joint {index[0] + 1}' if name.startswith('joint_') else LINK_NAMES[index[0]]
-        if np.isnan(number) or (np.isinf(number) and not (unlimited and number > 0)):
-            raise MechanismError(f'{name} of {place} must be finite, got {number}')
-        if lowest is None and number <= 0:
-            raise MechanismError(f'{name} of {place} must be positive, got {number:g}')
-        if lowest is not None and number < lowest:
-            raise MechanismError(f'{name} of {place} must not be negative, got {number:g}')
-    array.flags.writeable = False
-    return array
+    listed = values.tolist() if isinstance(values, np.ndarray) else values
+    return np.array(row.check_each(listed, elements, inner=inner), dtype=float)

@@ -13,14 +13,14 @@ from math import exp, inf, isnan
 from typing import Any
 
 from fourbar_ros.kernels.compiler import kernel
-from fourbar_ros.mechanism.constants import record
+from fourbar_ros.mechanism.constants import Fields, record
 from fourbar_ros.mechanism.mechanism import Mechanism
 import numpy as np
 
 # Bandwidth of the loop in the motor's own electronics that follows a commanded speed [rad/s].
 SPEED_BANDWIDTH = 60.0
 
-FIELDS: list[tuple[str, type, tuple[int, ...]]] = [
+FIELDS: Fields = [
     ('torque_limit', float, (4,)),      # N m
     ('speed_limit', float, (4,)),       # rad/s
     ('time_constant', float, (4,)),     # s

@@ -2,42 +2,48 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The state of the linkage as one vector, order a, b, c, d throughout.
+The state of the linkage as one vector, in the order a, b, c, d throughout.
 
-Link angles [rad] and rates [rad/s], wheel angles relative to the link [rad] and absolute wheel
-speeds [rad/s], position [m] and velocity [m/s] of the mass centre of the whole in the table
-frame; for joints that give, also how far and how fast [m, m/s] joints 1, 2 and 4 are open, x and y
-each in the table frame. Joint 3 is open by what the link angles and these leave.
+* `LINK_ANGLES` [rad] and `LINK_RATES` [rad/s] in the table frame.
+* `WHEEL_ANGLES` relative to the link [rad] and absolute `WHEEL_SPEEDS` [rad/s].
+* `CENTRE_POSITION` [m] and `CENTRE_VELOCITY` [m/s] of the mass centre of the whole, in the table
+  frame.
+* `JOINT_GAPS` [m] and `JOINT_GAP_RATES` [m/s] of the compliant joints 1, 2 and 4, x and y of each
+  in the table frame.
+* `JOINT_LOSS`: energy that the dampers of compliant joints have taken [J].
+* `LINK_MOMENTUM`: angular momentum of the links about the mass centre, summed over the steps
+  [kg m^2/s].
+* `CENTRE_COMPENSATION`: rounding error of the last sums for the position of the mass centre [m].
 
-Then comes the energy that the dampers in such joints have taken so far [J].
-
-The last three carry what rounding would lose in a million steps: the angular momentum of the
-links about the mass centre [kg m^2/s], which is taken from the rates where it does not fit them,
-and the rest of the last sums for the position of the mass centre [m]. Zero is a good start.
+The gap of joint 3 follows from the link angles and the other gaps. The last two keep what rounding
+would lose in a million steps; zero is a valid start, since the momentum is taken from the rates
+where it does not fit them.
 """
 
 from __future__ import annotations
 
+from fourbar_ros.kernels.compiler import kernel
+from fourbar_ros.kernels.linear_algebra import Vector4
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 from numpy.typing import ArrayLike
 
-LINK_ANGLES = slice(0, 4)
-LINK_RATES = slice(4, 8)
-WHEEL_ANGLES = slice(8, 12)
-WHEEL_SPEEDS = slice(12, 16)
-CENTRE_POSITION = slice(16, 18)
-CENTRE_VELOCITY = slice(18, 20)
-JOINT_GAPS = slice(20, 26)
-JOINT_GAP_RATES = slice(26, 32)
-JOINT_LOSS = 32
-SPIN = 33
-CENTRE_REST = slice(34, 36)
+# Indices for kernels; of a quantity that each link has, the column of link a.
+ANGLE, RATE, WHEEL_ANGLE, WHEEL_SPEED = 0, 4, 8, 12
+CENTRE_X, CENTRE_Y, VELOCITY_X, VELOCITY_Y = range(16, 20)
+GAP, GAP_RATE = 20, 26
+JOINT_LOSS, LINK_MOMENTUM, COMPENSATION_X, COMPENSATION_Y = range(32, 36)
 STATE_SIZE = 36
 
-# The same as single numbers, for the kernels.
-CENTRE_X, CENTRE_Y, VELOCITY_X, VELOCITY_Y = range(16, 20)
-REST_X, REST_Y = 34, 35
+LINK_ANGLES = slice(ANGLE, RATE)
+LINK_RATES = slice(RATE, WHEEL_ANGLE)
+WHEEL_ANGLES = slice(WHEEL_ANGLE, WHEEL_SPEED)
+WHEEL_SPEEDS = slice(WHEEL_SPEED, CENTRE_X)
+CENTRE_POSITION = slice(CENTRE_X, VELOCITY_X)
+CENTRE_VELOCITY = slice(VELOCITY_X, GAP)
+JOINT_GAPS = slice(GAP, GAP_RATE)
+JOINT_GAP_RATES = slice(GAP_RATE, JOINT_LOSS)
+CENTRE_COMPENSATION = slice(COMPENSATION_X, STATE_SIZE)
 
 
 def make_state(link_angles: ArrayLike, link_rates: ArrayLike = 0.0,
@@ -55,3 +61,15 @@ def make_state(link_angles: ArrayLike, link_rates: ArrayLike = 0.0,
     state[LINK_RATES] = link_rates
     state[WHEEL_SPEEDS] = link_rates if wheel_speeds is None else wheel_speeds
     return state
+
+
+@kernel
+def angles_of(state: Array) -> Vector4:
+    """Return the link angles of a state [rad]."""
+    return state[ANGLE], state[ANGLE + 1], state[ANGLE + 2], state[ANGLE + 3]
+
+
+@kernel
+def rates_of(state: Array) -> Vector4:
+    """Return the link rates of a state [rad/s]."""
+    return state[RATE], state[RATE + 1], state[RATE + 2], state[RATE + 3]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What the bearings of the wheels take of the torque of their motors.
+Friction of the wheel bearings.
 
 Within a step of the plant the torque is constant, at its mean; so impulse and work are exact.
 """
@@ -11,21 +11,21 @@ from __future__ import annotations
 
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism import Mechanism
-from fourbar_ros.mechanism.constants import record
-from fourbar_ros.mechanism.forces import grip
+from fourbar_ros.mechanism.constants import Fields, record
+from fourbar_ros.mechanism.forces import dry_friction
 from fourbar_ros.mechanism.motors import FIELDS as MOTOR_FIELDS
 from fourbar_ros.mechanism.motors import motor_values, Motors
 from fourbar_ros.plant.table import WheelBearings
 
-# Newton's method converges in three or four rounds; more is a number that is not finite.
-MOST_ROUNDS = 60
+MOST_ITERATIONS = 60
+"""Newton's method converges in three or four iterations unless a number is not finite."""
 
-# Friction that takes a smaller share of the speed in one step is followed by the middle of it.
-GENTLE = 0.5
+MIDPOINT_LIMIT = 0.5
+"""Share of the speed that friction may take in a step that uses the friction at its middle."""
 
 # Those of the motors come last: numba takes a record that begins like another for one of its kind,
 # and warns.
-FIELDS: list[tuple[str, type, tuple[int, ...]]] = [
+FIELDS: Fields = [
     ('viscous', float, ()),             # N m s
     ('coulomb', float, ()),             # N m
     ('static_ratio', float, ()),
@@ -53,10 +53,10 @@ def bearing_torque(speed: float, extra_coulomb: float, motors: Motors) -> float:
 
     :param extra_coulomb: beyond that of the bearing [N m].
     """
-    dry = motors.coulomb * grip(
+    dry = motors.coulomb * dry_friction(
         speed, motors.static_ratio, motors.stribeck_speed, motors.smoothing)
     if extra_coulomb > 0.0:
-        dry += extra_coulomb * grip(speed, 1.0, 1.0, motors.smoothing)
+        dry += extra_coulomb * dry_friction(speed, 1.0, 1.0, motors.smoothing)
     return float((motors.viscous + dry) * speed)
 
 
@@ -64,11 +64,10 @@ def bearing_torque(speed: float, extra_coulomb: float, motors: Motors) -> float:
 def friction_over_step(wheel: int, speed: float, torque: float, recoil: float,
                        extra_coulomb: float, step: float, motors: Motors) -> float:
     """
-    Find the friction torque that acts for a step [N m].
+    Evaluate the friction torque that acts during a step [N m].
 
-    Friction at rest is so stiff that an explicit step would chatter. It is taken at the speed
-    that the wheel has in the middle of the step, or, where it changes too fast with speed for
-    that, at its end.
+    Friction near rest is stiff, and an explicit step would chatter. Friction is evaluated at the
+    speed in the middle of the step, or, where it changes too fast with speed, at the end.
 
     :param speed: of the wheel relative to the link [rad/s].
     :param torque: of the motor [N m].
@@ -82,7 +81,7 @@ def friction_over_step(wheel: int, speed: float, torque: float, recoil: float,
     friction = bearing_torque(middle, extra_coulomb, motors)
     end = speed + drive - gain * friction
     slowest = min(abs(speed), abs(end)) if speed * end > 0.0 else 0.0
-    if gain * _friction_slope(slowest, extra_coulomb, motors) < GENTLE:
+    if gain * _friction_slope(slowest, extra_coulomb, motors) < MIDPOINT_LIMIT:
         return friction
     return bearing_torque(
         _implicit_speed(speed + drive, gain, extra_coulomb, motors), extra_coulomb, motors)
@@ -101,7 +100,7 @@ def _implicit_speed(free: float, gain: float, extra_coulomb: float, motors: Moto
     """Solve x + gain friction(x) = free; x lies between rest and free."""
     size = abs(free)
     low, high, x = 0.0, size, 0.0
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MOST_ITERATIONS):
         friction = bearing_torque(x, extra_coulomb, motors)
         rest = x + gain * friction - size
         if rest < 0.0:

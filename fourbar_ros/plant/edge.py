@@ -10,54 +10,63 @@ from typing import Any
 
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.kernels.linear_algebra import dot
-from fourbar_ros.mechanism.compliant import links_energy_and_spin
+from fourbar_ros.mechanism.compliant import link_energy_and_momentum
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.constrained import rates_of_impulse
-from fourbar_ros.mechanism.state import CENTRE_X, CENTRE_Y, SPIN, VELOCITY_X, VELOCITY_Y
+from fourbar_ros.mechanism.state import (
+    ANGLE,
+    angles_of,
+    CENTRE_X,
+    CENTRE_Y,
+    LINK_MOMENTUM,
+    RATE,
+    VELOCITY_X,
+    VELOCITY_Y,
+)
 import numpy as np
 from numpy.typing import NDArray
 
-# Joint 1 to 4: the links along which it lies from joint 1 (sign 1 where it is part of the way).
-WAYS = np.array([[0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0],
+# Joint 1 to 4: the links of the chain from joint 1 to it.
+CHAINS = np.array([[0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0],
                  [0.0, 1.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0]])
 
 
 @kernel
 def joint_levers(joint: int, state: Array, constants: Constants, lever: Array) -> None:
     """
-    Tell where a joint is, seen from the mass centre of the whole, as a sum over the links.
+    Evaluate the place of a joint relative to the mass centre of the whole, link by link.
 
     :param joint: 0 to 3 for joints 1 to 4.
     :param lever: (4, 2) receives each link's share, which turns with it [m].
     """
     for j in range(4):
-        # Joint 1 is where link a begins: its mass centre less the way to it.
-        x = constants.arms[0, j, 0] + WAYS[joint, j] * constants.lengths[j]
+        # Joint 1 is where link a begins: its mass centre less the vector to it.
+        x = constants.arms[0, j, 0] + CHAINS[joint, j] * constants.lengths[j]
         y = constants.arms[0, j, 1]
         if j == 0:
             x -= constants.com_positions[0, 0]
             y -= constants.com_positions[0, 1]
-        c, s = cos(state[j]), sin(state[j])
+        c, s = cos(state[ANGLE + j]), sin(state[ANGLE + j])
         lever[j, 0], lever[j, 1] = c * x - s * y, s * x + c * y
 
 
 @kernel
-def joint_motion(joint: int, state: Array, boxed: NDArray[Any]
+def joint_motion(joint: int, state: Array, packed: NDArray[Any]
                  ) -> tuple[float, float, float, float]:
     """
     Return position x, y [m] and velocity x, y [m/s] of a joint in the table frame.
 
     :param joint: 0 to 3 for joints 1 to 4.
-    :param boxed: (1,) constants of the mechanism.
+    :param packed: (1,) constants of the mechanism.
     """
     lever = np.empty((4, 2))
-    joint_levers(joint, state, boxed[0], lever)
+    joint_levers(joint, state, packed[0], lever)
     x, y = state[CENTRE_X], state[CENTRE_Y]
     speed_x, speed_y = state[VELOCITY_X], state[VELOCITY_Y]
     for j in range(4):
         x, y = x + lever[j, 0], y + lever[j, 1]
-        speed_x -= state[4 + j] * lever[j, 1]
-        speed_y += state[4 + j] * lever[j, 0]
+        speed_x -= state[RATE + j] * lever[j, 1]
+        speed_y += state[RATE + j] * lever[j, 0]
     return x, y, speed_x, speed_y
 
 
@@ -67,20 +76,20 @@ def meet_edges(state: Array, half_x: float, half_y: float, restitution: float,
     """
     Turn back every joint that moves out over an edge, by an impulse across the edge.
 
-    Joints that give are taken as rigid for that instant; what it does to energy and spin is then
-    told from both, before and after.
+    Compliant joints are rigid for that instant; the changes of energy and momentum are then those
+    of the state.
 
     :param state: changed in place: rates of the links, velocity of the mass centre.
     :param half_x, half_y: from the middle of the table to its edges [m].
     :param lever: (4, 2) to work in.
-    :returns: how many were turned back, energy that was lost [J], and angular impulse about the
-        mass centre [N m s].
+    :returns: number of contacts, energy lost [J], and angular impulse about the mass centre
+        [N m s].
     """
     count, lost, turn = 0, 0.0, 0.0
-    angles = (state[0], state[1], state[2], state[3])
-    energy = spin = 0.0
+    angles = angles_of(state)
+    energy = momentum = 0.0
     if constants.compliant:
-        energy, spin = links_energy_and_spin(state, constants)
+        energy, momentum = link_energy_and_momentum(state, constants)
     for joint in range(4):
         joint_levers(joint, state, constants, lever)
         for axis in range(2):
@@ -92,23 +101,23 @@ def meet_edges(state: Array, half_x: float, half_y: float, restitution: float,
             sign = -1.0 if axis == 0 else 1.0
             for j in range(4):
                 place += lever[j, axis]
-                speed += sign * state[4 + j] * lever[j, across]
+                speed += sign * state[RATE + j] * lever[j, across]
             if not (abs(place) > half and place * speed > 0.0):
                 continue
-            push = (sign * lever[0, across], sign * lever[1, across],
+            direction = (sign * lever[0, across], sign * lever[1, across],
                     sign * lever[2, across], sign * lever[3, across])
-            gain = rates_of_impulse(angles, push, constants)
+            gain = rates_of_impulse(angles, direction, constants)
             impulse = -(1.0 + restitution) * speed / (
-                1.0 / constants.total_mass + dot(push, gain))
+                1.0 / constants.total_mass + dot(direction, gain))
             for j in range(4):
-                state[4 + j] += impulse * gain[j]
+                state[RATE + j] += impulse * gain[j]
             state[VELOCITY_X + axis] += impulse / constants.total_mass
             count += 1
             # Work of an impulse: half of it times the speeds before and after.
             lost -= 0.5 * impulse * (1.0 - restitution) * speed
-            turn += impulse * (push[0] + push[1] + push[2] + push[3])
+            turn += impulse * (direction[0] + direction[1] + direction[2] + direction[3])
     if count and constants.compliant:
-        energy_after, spin_after = links_energy_and_spin(state, constants)
-        lost, turn = energy - energy_after, spin_after - spin
-    state[SPIN] += turn
+        energy_after, momentum_after = link_energy_and_momentum(state, constants)
+        lost, turn = energy - energy_after, momentum_after - momentum
+    state[LINK_MOMENTUM] += turn
     return count, lost, turn

@@ -16,7 +16,7 @@ from math import isfinite
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.mechanism import assemble, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.change_points import RATES_UNDETERMINED
-from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.constants import Array, record
 from fourbar_ros.mechanism.dynamics import gamma_matrix, mass_matrix
 from fourbar_ros.mechanism.state import (
     CENTRE_POSITION,
@@ -29,18 +29,20 @@ from fourbar_ros.mechanism.state import (
 )
 from fourbar_ros.plant.bearings import drives_of
 from fourbar_ros.plant.edge import joint_levers, joint_motion
-from fourbar_ros.plant.energy_budget import balance, CONTACTS, EnergyBudget, nothing_added
+from fourbar_ros.plant.energy_budget import empty_sums, energy_budget, EnergyBudget
 from fourbar_ros.plant.sensors import LinkSensors
 from fourbar_ros.plant.settings import InitialState
 from fourbar_ros.plant.step import (
     advance_plant,
-    Boxed,
-    MOTOR_STATE_SIZE,
+    MODES,
+    MOTOR_STATES,
+    Packed,
+    PARAMETERS,
     SOUND,
 )
 from fourbar_ros.plant.table import quantum, surroundings_of, Table
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 # What dry friction in a joint makes of a rate must be slower than a step can follow (its real
 # limit for Runge-Kutta of order four is 2.8, here with a margin for other poses).
@@ -98,6 +100,7 @@ class Plant:
     :param step_s: integration step [s].
     :param generator: source of all randomness.
     :ivar link_sensors: with the samples on their way.
+    :ivar motor_states: (4,) of `step.MOTOR_STATES`.
     :ivar efforts: (4,) mean torque of each motor since the last call of `advance` [N m].
     :raises PlantError: the step is not a positive number, or too long for the friction.
     :raises ClosureError: the loop cannot close at the initial angles, or unknown branch.
@@ -115,20 +118,20 @@ class Plant:
         self.link_sensors = LinkSensors(
             table.link_sensors, np.random.SeedSequence(generator.integers(2**63)))
         surface = table.surface
-        self._half_sizes = 0.5 * np.array([surface.size_x, surface.size_y])
-        # Arrays of one, see Boxed.
+        self._parameters = np.array([record(
+            PARAMETERS, constants=mechanism.constants, around=surroundings_of(table),
+            motors=drives_of(mechanism, table.wheel_bearings), step=step_s,
+            half_sizes=[0.5 * surface.size_x, 0.5 * surface.size_y],
+            restitution=surface.restitution)])
+        self._parameters['around']['acting'] |= table.disturbance.acting
         self._constants = np.array([mechanism.constants])
-        self._motors = np.array([drives_of(mechanism, table.wheel_bearings)])
-        self._around = np.array([surroundings_of(table)])
-        self._around['acting'] |= table.disturbance.acting
         self._walked = np.zeros(2)
         self._walked_for: float | None = None
         self.efforts = np.zeros(4)
         self.reset(initial)
         self._check_friction()
         # Compile the kernels now, not while time runs.
-        none = np.zeros(4, dtype=bool)
-        self._advance(np.zeros((1, 4)), none, none, SOUND)
+        self.advance(1, np.zeros(4), powered=False)
         self.reset(initial)
 
     def _check_friction(self) -> None:
@@ -162,16 +165,16 @@ class Plant:
         self._state = state
         self._start = self._state.copy()
         self.link_sensors.reset()
-        self._motor_state = np.zeros(MOTOR_STATE_SIZE)
-        self._motor_state[4:] = np.nan     # no wheel follows a speed yet
-        self._added = nothing_added()
+        self.motor_states = np.zeros(4, MOTOR_STATES)
+        self.motor_states['integral'] = np.nan     # no wheel follows a speed yet
+        self._sums = empty_sums()
         self.efforts[:] = 0.0
 
     def _check_place(self, state: Array) -> None:
-        lever = np.empty((4, 2))
+        lever, half_sizes = np.empty((4, 2)), self._parameters['half_sizes'][0]
         for joint in range(4):
             joint_levers(joint, state, self.mechanism.constants, lever)
-            beyond = np.abs(state[CENTRE_POSITION] + lever.sum(axis=0)) - self._half_sizes
+            beyond = np.abs(state[CENTRE_POSITION] + lever.sum(axis=0)) - half_sizes
             if beyond.max() > 0.0:
                 raise PlantError(
                     f'joint {joint + 1} would start {beyond.max():.3g} m beyond the edge of the '
@@ -208,10 +211,16 @@ class Plant:
             self._walked_for = duration_s
             torques[:2] += self._walked
         if disturbance.acting:
-            self._around['link_torques'][0] = torques
+            self.apply_link_torques(torques)
+
+    def apply_link_torques(self, torques: ArrayLike) -> None:
+        """Apply torques (4,) to the links from outside, until the next ones [N m]."""
+        around = self._parameters['around']
+        around['link_torques'][0] = torques
+        around['acting'] = True
 
     def advance(self, steps: int, commands: Array, by_speed: ArrayLike = False,
-                powered: ArrayLike = True, conditions: Boxed = SOUND) -> None:
+                powered: ArrayLike = True, conditions: Packed = SOUND) -> None:
         """
         Move on by a number of steps.
 
@@ -223,22 +232,14 @@ class Plant:
         :param conditions: what is wrong with the wheels.
         :raises PlantError: the state is no longer finite.
         """
-        followed, live = np.empty(4, dtype=bool), np.empty(4, dtype=bool)
-        followed[:] = by_speed
-        live[:] = powered
-        held = np.empty((steps, 4))
+        modes, held = np.empty(4, MODES), np.empty((steps, 4))
+        modes['by_speed'] = by_speed
+        modes['powered'] = powered
         held[:] = commands
-        self._advance(held, followed, live, conditions)
+        advance_plant(self._state, self.motor_states, held, modes, self._parameters, conditions,
+                      self.efforts, self._sums)
         if not np.isfinite(self._state).all():
             raise PlantError('the state of the plant is no longer finite')
-
-    def _advance(self, commands: Array, by_speed: NDArray[np.bool_],
-                 powered: NDArray[np.bool_], conditions: Boxed) -> None:
-        surface = self._table.surface
-        advance_plant(
-            self._state, self._motor_state, commands, by_speed, powered, self.step_s,
-            self._constants, self._around, self._motors, conditions,
-            self._half_sizes, float(surface.restitution), self.efforts, self._added)
 
     def truth(self, efforts: Array | None = None) -> Truth:
         """
@@ -257,11 +258,11 @@ class Plant:
     @property
     def contacts(self) -> int:
         """How often a joint met the edge of the table since the start or the last reset."""
-        return int(self._added[CONTACTS])
+        return int(self._sums['contacts'][0])
 
     def ledger(self) -> EnergyBudget:
         """Draw up the accounts of energy and momentum since the start or the last reset."""
-        return balance(self.mechanism, self._state, self._start, self._added)
+        return energy_budget(self.mechanism, self._state, self._start, self._sums)
 
     def measure_links(self, stamp_ns: int) -> None:
         """Let the link sensors take a sample now, if one is due [ns]."""

@@ -4,9 +4,9 @@
 """
 The plant in motion: motors, bearings, linkage and edge, one small step after the other.
 
-In each step the torque on every wheel is constant: the mean of what the motor gives, less the
-friction of the bearing (`plant.bearings`). So the linkage moves as the mechanics have it, impulse
-and work of every torque are exact, and only friction in joints and drag need a quadrature.
+In each step the torque on every wheel is constant: the mean motor torque less the friction of the
+bearing (`plant.bearings`). So impulse and work of every torque are exact, and only friction in
+joints and drag need a quadrature.
 """
 
 from __future__ import annotations
@@ -15,181 +15,186 @@ from math import cos, isfinite, isnan, nan, sin
 from typing import Any
 
 from fourbar_ros.kernels.compiler import kernel
-from fourbar_ros.mechanism.compliant import body_losses
-from fourbar_ros.mechanism.constants import Array, Constants, record
-from fourbar_ros.mechanism.forces import losses, Surroundings
+from fourbar_ros.kernels.runge_kutta import Drive
+from fourbar_ros.mechanism.compliant import compliant_losses
+from fourbar_ros.mechanism.constants import Array, Fields, record
+from fourbar_ros.mechanism.constants import FIELDS as CONSTANTS
+from fourbar_ros.mechanism.forces import FIELDS as SURROUNDINGS
+from fourbar_ros.mechanism.forces import Losses, losses, System
 from fourbar_ros.mechanism.integration import advance_state, evaluate
 from fourbar_ros.mechanism.motors import available_torque, lagged_torque, Motors, speed_loop
-from fourbar_ros.mechanism.state import CENTRE_X, CENTRE_Y, STATE_SIZE, VELOCITY_X, VELOCITY_Y
+from fourbar_ros.mechanism.state import (
+    ANGLE,
+    angles_of,
+    CENTRE_X,
+    RATE,
+    rates_of,
+    STATE_SIZE,
+    VELOCITY_X,
+    VELOCITY_Y,
+    WHEEL_ANGLE,
+    WHEEL_SPEED,
+)
+from fourbar_ros.plant.bearings import FIELDS as DRIVES
 from fourbar_ros.plant.bearings import friction_over_step
 from fourbar_ros.plant.edge import meet_edges
-from fourbar_ros.plant.energy_budget import (
-    BEARINGS,
-    CONTACTS,
-    COPPER,
-    DISTURBANCE,
-    DISTURBANCE_SPIN,
-    DRAG,
-    DRAG_SPIN,
-    EDGE,
-    EDGE_SPIN,
-    ELECTRICAL,
-    JOINTS,
-    TILT,
-)
 from fourbar_ros.plant.faults import WheelFaults
 import numpy as np
 from numpy.typing import NDArray
 
-FIELDS: list[tuple[str, type, tuple[int, ...]]] = [
-    ('scale', float, (4,)),             # of the torque that is asked for
-    ('forced', float, (4,)),            # N m, whatever a powered motor is asked for; NaN for none
+CONDITIONS: Fields = [
+    ('scale', float, (4,)),             # of the commanded torque
+    ('forced', float, (4,)),            # N m, of a powered motor whatever its command; NaN: none
     ('shorted', float, (4,)),           # N m, powered or not; NaN for none
     ('extra_coulomb', float, (4,)),     # N m
 ]
-
 WheelConditions = np.record
-"""What is wrong with the wheels."""
+"""The effects of faults on the wheels, a scalar of `CONDITIONS`."""
 
-Boxed = NDArray[Any]
-"""An array of one record: a record by itself takes longer to hand to a kernel than it runs."""
+PARAMETERS: Fields = [
+    ('constants', np.dtype((np.record, CONSTANTS)), ()),
+    ('around', np.dtype((np.record, SURROUNDINGS)), ()),
+    ('motors', np.dtype((np.record, DRIVES)), ()),
+    ('step', float, ()),                # s
+    ('half_sizes', float, (2,)),        # m, from the middle of the table to its edges
+    ('restitution', float, ()),         # of the edge
+]
+"""The parameters of the plant, for its kernel."""
 
-SOUND = np.array([record(FIELDS, scale=1.0, forced=nan, shorted=nan, extra_coulomb=0.0)])
-"""The conditions, boxed, where nothing is wrong."""
+MODES = np.dtype([('by_speed', bool), ('powered', bool)])
+"""How a wheel is driven: by a commanded speed or torque, with or without power."""
+
+MOTOR_STATES = np.dtype([('torque', float), ('integral', float)])
+"""State of a motor: its torque [N m], and the integral of its speed loop [N m], NaN at rest."""
+
+Packed = NDArray[Any]
+"""An array of one record: numba takes longer to receive a record by itself than to use it."""
+
+SOUND: Packed = np.array([record(
+    CONDITIONS, scale=1.0, forced=nan, shorted=nan, extra_coulomb=0.0)])
+"""The conditions of wheels without a fault."""
 
 
-def conditions_of(faults: WheelFaults) -> Boxed:
-    """Turn faults of the wheels into what the kernels take; their delays act elsewhere."""
+def conditions_of(faults: WheelFaults) -> Packed:
+    """Return the conditions for the kernels; delays of commands act in the device."""
     return np.array([record(
-        FIELDS, scale=faults.torque_scale, forced=faults.forced_torque,
+        CONDITIONS, scale=faults.torque_scale, forced=faults.forced_torque,
         shorted=faults.shorted_torque, extra_coulomb=faults.extra_friction + faults.hold_torque)])
-
-
-# The state of a motor: its torque now [N m], and what its speed loop has learnt [N m].
-MOTOR_STATE_SIZE = 8
 
 
 @kernel
 def advance_plant(
-    state: Array, motor_state: Array, commands: Array, by_speed: NDArray[np.bool_],
-    powered: NDArray[np.bool_], step: float, boxed_constants: Boxed, boxed_around: Boxed,
-    boxed_motors: Boxed, boxed_conditions: Boxed, half_sizes: Array, restitution: float,
-    efforts: Array, added: Array,
+    state: Array, motor_states: NDArray[Any], commands: Array, modes: NDArray[Any],
+    parameters: Packed, conditions: Packed, efforts: Array, sums: Packed,
 ) -> None:
     """
-    Advance the plant by as many steps as there are commands, in place.
+    Advance the plant by one step for each command, in place.
 
-    :param state: (STATE_SIZE,), see mechanism.layout.
-    :param motor_state: (8,).
+    :param state: (STATE_SIZE,).
+    :param motor_states: (4,) of `MOTOR_STATES`.
     :param commands: (n, 4) torques [N m], or speeds relative to the links [rad/s].
-    :param by_speed: (4,) bool, which of both for each wheel.
-    :param powered: (4,) bool, whose power stage is on.
-    :param half_sizes: (2,) from the middle of the table to its edges [m].
-    :param restitution: of the edge.
+    :param modes: (4,) of `MODES`.
+    :param parameters, conditions: (1,) of `PARAMETERS` and `CONDITIONS`.
     :param efforts: (4,) receives the mean torque of the motors [N m].
-    :param added: (SIZE,) of plant.ledger, is added to.
+    :param sums: (1,) of `energy_budget.SUMS`, is added to.
     """
-    constants, around = boxed_constants[0], boxed_around[0]
-    motors, conditions = boxed_motors[0], boxed_conditions[0]
+    plant, faults, budget = parameters[0], conditions[0], sums[0]
+    constants, around, motors, step = plant.constants, plant.around, plant.motors, plant.step
+    system = System(constants, around)
     steps = commands.shape[0]
-    given, torques, recoil = np.empty(4), np.empty(4), np.zeros(STATE_SIZE)
-    before, lever = np.empty(10), np.empty((4, 2))
+    motor_torques, torques, recoil = np.empty(4), np.empty(4), np.zeros(STATE_SIZE)
+    before, lever = np.empty(STATE_SIZE), np.empty((4, 2))
+    drive = Drive(torques, torques, torques)
     efforts[:] = 0.0
     for j in range(4):
-        if not (by_speed[j] and powered[j]):
-            motor_state[4 + j] = nan    # its speed loop starts anew, whenever that is
-    lost = _losses(state, constants, around)
-    bounded = isfinite(half_sizes[0]) or isfinite(half_sizes[1])
+        if not (modes[j].by_speed and modes[j].powered):
+            motor_states[j].integral = nan      # its speed loop starts anew
+    lost = _losses(state, system)
+    bounded = isfinite(plant.half_sizes[0]) or isfinite(plant.half_sizes[1])
     for n in range(steps):
         rubbing = False
         for j in range(4):
-            given[j] = _motor_torque(
-                j, commands[n, j], by_speed[j], powered[j], state[12 + j] - state[4 + j],
-                motor_state, step, motors, conditions)
-            efforts[j] += given[j] / steps
+            speed = state[WHEEL_SPEED + j] - state[RATE + j]
+            motor_torques[j] = _motor_torque(
+                j, commands[n, j], modes[j], speed, motor_states[j], step, motors, faults)
+            efforts[j] += motor_torques[j] / steps
             friction = friction_over_step(
-                j, state[12 + j] - state[4 + j], given[j], 0.0, conditions.extra_coulomb[j],
-                step, motors)
+                j, speed, motor_torques[j], 0.0, faults.extra_coulomb[j], step, motors)
             rubbing = rubbing or friction != 0.0
-            torques[j] = given[j] - friction
+            torques[j] = motor_torques[j] - friction
         if rubbing:
-            # What friction does depends a little on how the links give way.
+            # Friction depends a little on the acceleration of the links.
             evaluate(state, torques, constants, around, recoil)
             for j in range(4):
-                torques[j] = given[j] - friction_over_step(
-                    j, state[12 + j] - state[4 + j], given[j], recoil[4 + j],
-                    conditions.extra_coulomb[j], step, motors)
-        before[0:4] = state[0:4]
-        before[4:8] = state[8:12]
-        before[8:10] = state[CENTRE_X:CENTRE_Y + 1]
-        advance_state(state, torques, torques, torques, step, constants, around)
+                torques[j] = motor_torques[j] - friction_over_step(
+                    j, state[WHEEL_SPEED + j] - state[RATE + j], motor_torques[j],
+                    recoil[RATE + j], faults.extra_coulomb[j], step, motors)
+        before[:] = state
+        advance_state(state, drive, step, system)
         for j in range(4):
-            turned = state[8 + j] - before[4 + j]
-            current = given[j] / motors.torque_constant[j]
+            turned = state[WHEEL_ANGLE + j] - before[WHEEL_ANGLE + j]
+            current = motor_torques[j] / motors.torque_constant[j]
             heat = motors.resistance[j] * current * current * step
-            added[COPPER] += heat
-            added[ELECTRICAL] += given[j] * turned + heat
-            added[BEARINGS] += (given[j] - torques[j]) * turned
+            budget.copper += heat
+            budget.supplied += motor_torques[j] * turned + heat
+            budget.bearings += (motor_torques[j] - torques[j]) * turned
         if around.acting:
-            earlier, lost = lost, _losses(state, constants, around)
-            _add_effects(state, before, earlier, lost, step, constants, around, added)
+            earlier, lost = lost, _losses(state, system)
+            _add_effects(state, before, earlier, lost, step, system, sums)
         if bounded:
             count, heat, turn = meet_edges(
-                state, half_sizes[0], half_sizes[1], restitution, constants, lever)
+                state, plant.half_sizes[0], plant.half_sizes[1], plant.restitution, constants,
+                lever)
             if count:
-                added[CONTACTS] += count
-                added[EDGE] += heat
-                added[EDGE_SPIN] += turn
-                lost = _losses(state, constants, around)
+                budget.contacts += count
+                budget.edge += heat
+                budget.edge_spin += turn
+                lost = _losses(state, system)
 
 
 @kernel
-def _motor_torque(wheel: int, command: float, by_speed: bool, powered: bool, speed: float,
-                  motor_state: Array, step: float, motors: Motors,
-                  conditions: WheelConditions) -> float:
-    """Return the mean torque that a motor gives over a step [N m]."""
-    asked = conditions.forced[wheel] if powered else 0.0
-    if not isnan(conditions.shorted[wheel]):
-        asked = conditions.shorted[wheel]
+def _motor_torque(wheel: int, command: float, mode: Any, speed: float, motor_state: Any,
+                  step: float, motors: Motors, faults: WheelConditions) -> float:
+    """Return the mean torque of a motor over a step [N m]."""
+    asked = faults.forced[wheel] if mode.powered else 0.0
+    if not isnan(faults.shorted[wheel]):
+        asked = faults.shorted[wheel]
     if isnan(asked):
         asked = command
-        if by_speed:
-            asked, motor_state[4 + wheel] = speed_loop(
-                wheel, command, speed, motor_state[4 + wheel], step, motors)
-        asked *= conditions.scale[wheel]
+        if mode.by_speed:
+            asked, motor_state.integral = speed_loop(
+                wheel, command, speed, motor_state.integral, step, motors)
+        asked *= faults.scale[wheel]
     target = available_torque(wheel, asked, speed, motors)
-    mean, motor_state[wheel] = lagged_torque(wheel, motor_state[wheel], target, step, motors)
+    mean, motor_state.torque = lagged_torque(wheel, motor_state.torque, target, step, motors)
     if abs(speed) >= motors.speed_limit[wheel] and mean * speed > 0.0:
-        mean = motor_state[wheel] = 0.0
+        mean = motor_state.torque = 0.0
     return mean
 
 
 @kernel
-def _losses(state: Array, constants: Constants, around: Surroundings
-            ) -> tuple[float, float, float]:
-    if not around.acting:
-        return 0.0, 0.0, 0.0
-    if constants.compliant:
-        return body_losses(state, constants, around)
+def _losses(state: Array, system: System) -> Losses:
+    if not system.around.acting:
+        return Losses(0.0, 0.0, 0.0)
+    if system.constants.compliant:
+        return compliant_losses(state, system)
+    a, b, c, d = angles_of(state)
     return losses(
-        (cos(state[0]), cos(state[1]), cos(state[2]), cos(state[3])),
-        (sin(state[0]), sin(state[1]), sin(state[2]), sin(state[3])),
-        (state[4], state[5], state[6], state[7]), (state[VELOCITY_X], state[VELOCITY_Y]),
-        constants, around)
+        (cos(a), cos(b), cos(c), cos(d)), (sin(a), sin(b), sin(c), sin(d)), rates_of(state),
+        (state[VELOCITY_X], state[VELOCITY_Y]), system)
 
 
 @kernel
-def _add_effects(state: Array, before: Array, earlier: tuple[float, float, float],
-                 later: tuple[float, float, float], step: float,
-                 constants: Constants, around: Surroundings, added: Array) -> None:
-    """Book what acted in a step: work of constant forces exactly, losses by the trapezoid."""
-    half = 0.5 * step
-    added[JOINTS] += half * (earlier[0] + later[0])
-    added[DRAG] += half * (earlier[1] + later[1])
-    added[DRAG_SPIN] += half * (earlier[2] + later[2])
+def _add_effects(state: Array, before: Array, earlier: Losses, later: Losses, step: float,
+                 system: System, sums: Packed) -> None:
+    """Add the effects of a step: work of constant forces exactly, losses by the trapezoid."""
+    constants, around, budget, half = system.constants, system.around, sums[0], 0.5 * step
+    budget.joints += half * (earlier.joint_power + later.joint_power)
+    budget.drag += half * (earlier.drag_power + later.drag_power)
+    budget.drag_spin += half * (earlier.drag_torque + later.drag_torque)
     for axis in range(2):
-        added[TILT] += constants.total_mass * around.gravity[axis] * (
-            state[CENTRE_X + axis] - before[8 + axis])
+        budget.tilt += constants.total_mass * around.gravity[axis] * (
+            state[CENTRE_X + axis] - before[CENTRE_X + axis])
     for j in range(4):
-        added[DISTURBANCE] += around.link_torques[j] * (state[j] - before[j])
-        added[DISTURBANCE_SPIN] += around.link_torques[j] * step
+        budget.disturbance += around.link_torques[j] * (state[ANGLE + j] - before[ANGLE + j])
+        budget.disturbance_spin += around.link_torques[j] * step

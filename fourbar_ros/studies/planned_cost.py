@@ -19,10 +19,11 @@ from fourbar_ros.control.branch import branch_at, LINKS_ALONE
 from fourbar_ros.control.feasibility import wheel_loads
 from fourbar_ros.control.setpoint import angles_along
 from fourbar_ros.control.soft_step import SoftStep, TrajectorySegment
+from fourbar_ros.kernels.runge_kutta import Drive
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix
-from fourbar_ros.mechanism.forces import forces_along, NOTHING
+from fourbar_ros.mechanism.forces import forces_along, NOTHING, System
 from fourbar_ros.mechanism.integration import advance_state
 from fourbar_ros.mechanism.state import LINK_ANGLES
 from fourbar_ros.plant import Table
@@ -231,8 +232,8 @@ def simulate_torques(mechanism: Mechanism, state: Array, torques: Array, step: f
     state = state.copy()
     angles = [state[LINK_ANGLES].copy()]
     for n in range(0, len(torques) - 2, 2):
-        advance_state(state, torques[n], torques[n + 1], torques[n + 2], step,
-                      mechanism.constants, NOTHING)
+        advance_state(state, Drive(torques[n], torques[n + 1], torques[n + 2]), step,
+                      System(mechanism.constants, NOTHING))
         angles.append(state[LINK_ANGLES].copy())
     return np.array(angles)
 

@@ -140,8 +140,7 @@ def test_constant_torque_is_foretold_long_before(steer: Callable[..., Any],
     known beforehand.
     """
     steered = steer(prototype, InitialState())
-    steered.plant._around['link_torques'][0] = [TORQUE, 0.0, 0.0, 0.0]
-    steered.plant._around['acting'] = True
+    steered.plant.apply_link_torques([TORQUE, 0.0, 0.0, 0.0])
     steered.disturbance = np.array([TORQUE, 0.0])
     steered.ticks(round(10.0 / PERIOD))
     truth, watch = steered.plant.truth(), steered.controller.momentum

@@ -3,12 +3,13 @@
 """Many motions at once: the same bytes as one by one."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from threading import Thread
 
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.forces import NOTHING, surroundings
-from fourbar_ros.mechanism.integration import move_batch, move_held
+from fourbar_ros.mechanism.integration import BatchError, move_batch, move_held
 from fourbar_ros.mechanism.state import STATE_SIZE
 import numba
 import numpy as np
@@ -104,20 +105,21 @@ def test_batches_of_two_threads_wait_for_each_other(
         assert part.tobytes() == np.tile(np.roll(alone, n, axis=0), (7, 1)).tobytes()
 
 
-@pytest.mark.parametrize(('made', 'word'), [
-    (lambda states: np.repeat(states, 2, axis=0)[::2], 'contiguous: False'),
-    (np.asfortranarray, 'contiguous: False'), (lambda states: states.astype(int), 'int64'),
-    (lambda states: states.astype(np.float32), 'float32'),
-    (lambda states: np.broadcast_to(states, states.shape), 'writeable: False')],
+@pytest.mark.parametrize('made', [
+    lambda states: np.repeat(states, 2, axis=0)[::2],
+    np.asfortranarray, lambda states: states.astype(int),
+    lambda states: states.astype(np.float32),
+    lambda states: np.broadcast_to(states, states.shape)],
     ids=['rows', 'columns', 'integers', 'single', 'read-only'])
 def test_states_that_lie_in_another_way_are_refused(
-    made: Callable[[Array], Array], word: str, campaign: tuple[list[Mechanism], Array, Array],
+    made: Callable[[Array], Array], campaign: tuple[list[Mechanism], Array, Array],
+    refuses: Callable[..., AbstractContextManager[None]],
 ) -> None:
     """Not done by halves, and nothing is compiled for them."""
     linkages, states, torques = campaign
     given = made(states)
     before = given.copy()
-    with pytest.raises(ValueError, match=word):
+    with refuses(BatchError, name='states', value=given.dtype):
         move_batch(given, torques, 1e-3, 10, linkages[0].constants, NOTHING)
     np.testing.assert_array_equal(given, before)
 
@@ -143,15 +145,11 @@ def test_no_states_are_no_work(campaign: tuple[list[Mechanism], Array, Array]) -
     ((3, STATE_SIZE), (3, 4), 0, 1), ((3, STATE_SIZE), (3, 4), 1, 2)])
 def test_what_does_not_fit_is_refused(
     states: tuple[int, ...], torques: tuple[int, ...], mechanisms: int, surrounded: int,
-    paper: Mechanism,
+    paper: Mechanism, refuses: Callable[..., AbstractContextManager[None]],
 ) -> None:
-    """And told with the sizes that were given."""
     constants = np.array([paper.constants] * 4)[:mechanisms]
     around = np.array([NOTHING] * 2)[:surrounded]
     before = np.zeros(states)
-    with pytest.raises(ValueError, match='1 or n constants') as refusal:
+    with refuses(BatchError, value=(states, torques, mechanisms, surrounded)):
         move_batch(before, np.ones(torques), 1e-3, 1, constants, around)
-    assert str(states) in str(refusal.value)
-    assert str(torques) in str(refusal.value)
-    assert f'got {mechanisms} and {surrounded}' in str(refusal.value)
     assert not before.any()

@@ -3,18 +3,20 @@
 """Case files, good and bad, prescribed wheels in them, and which branch a motion was on."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 import json
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.mechanism import ClosureError, load_mechanism, MechanismError
+from fourbar_ros.mechanism import ClosureError, FLYWHEEL_NAMES, load_mechanism
 from fourbar_ros.mechanism.case import Case, CaseError, load_case, simulate
 import numpy as np
 from numpy.typing import NDArray
 import pytest
 
 Array = NDArray[np.float64]
+Refuses = Callable[..., AbstractContextManager[None]]
 NONE = np.zeros(4)
 REFERENCE = Path(__file__).parents[2] / 'config' / 'reference'
 COSINE = {'amplitude': [10.0], 'frequency_hz': [0.5], 'phase': [0.0]}
@@ -124,153 +126,135 @@ def test_motion_begins_with_the_initial_state_at_the_given_times(
 
 # --- Bad files --------------------------------------------------------------------------------
 
-@pytest.mark.parametrize(('changes', 'message'), [
+@pytest.mark.parametrize(('changes', 'values'), [
     ({'wheel_angle': {'flywheels': ['flywheel_x'], **COSINE}},
-     "wheel_angle: no flywheel 'flywheel_x' (known are flywheel_a, flywheel_b, flywheel_c, "
-     'flywheel_d)'),
-    ({'wheel_angle': {'flywheels': ['link_a'], **COSINE}}, "no flywheel 'link_a'"),
-    ({'wheel_angle': {'flywheels': [0], **COSINE}}, 'no flywheel 0'),
-    ({'wheel_angle': {'flywheels': [['flywheel_a']], **COSINE}}, "no flywheel ['flywheel_a']"),
+     {'name': 'flywheels', 'value': 'flywheel_x', 'limit': FLYWHEEL_NAMES}),
+    ({'wheel_angle': {'flywheels': ['link_a'], **COSINE}}, {'value': 'link_a'}),
+    ({'wheel_angle': {'flywheels': [0], **COSINE}}, {'value': 0}),
+    ({'wheel_angle': {'flywheels': [['flywheel_a']], **COSINE}}, {'value': ['flywheel_a']}),
     ({'wheel_angle': {'flywheels': ['flywheel_a'] * 2, **COSINE}},
-     "wheel_angle needs flywheels, a list of different names, got ['flywheel_a', 'flywheel_a']"),
-    ({'wheel_angle': {'flywheels': [], **COSINE}}, 'a list of different names, got []'),
-    ({'wheel_angle': {'flywheels': 'flywheel_a', **COSINE}}, "names, got 'flywheel_a'"),
-    ({'wheel_angle': COSINE}, 'a list of different names, got None'),
-    ({'wheel_angle': ['flywheel_a']}, 'wheel_angle is missing or is not an object'),
+     {'name': 'flywheels', 'value': ['flywheel_a', 'flywheel_a']}),
+    ({'wheel_angle': {'flywheels': [], **COSINE}}, {'name': 'flywheels', 'value': []}),
+    ({'wheel_angle': {'flywheels': 'flywheel_a', **COSINE}},
+     {'name': 'flywheels', 'value': 'flywheel_a'}),
+    ({'wheel_angle': COSINE}, {'name': 'flywheels', 'value': None}),
+    ({'wheel_angle': ['flywheel_a']}, {'name': 'wheel_angle'}),
     ({'wheel_angle': {'flywheels': ['flywheel_a', 'flywheel_b'], **COSINE}},
-     'amplitude must be 2 numbers, got shape (1,)'),
+     {'name': 'amplitude', 'value': 1, 'limit': 2}),
     ({'wheel_angle': {'flywheels': ['flywheel_a'], **COSINE, 'phase': 1.0}},
-     'phase must be 1 number, got shape ()'),
-    ({'wheel_angle': {'flywheels': ['flywheel_a'], **COSINE, 'frequency_hz': [float('inf')]}},
-     'frequency_hz must be finite, got inf'),
+     {'name': 'phase', 'value': 1.0, 'limit': list}),
+    ({'wheel_angle': {'flywheels': ['flywheel_a'], **COSINE, 'frequency_hz': [inf]}},
+     {'name': 'frequency_hz.flywheel_a', 'value': inf}),
     ({'wheel_angle': {'flywheels': ['flywheel_a'], 'amplitude': [1.0], 'phase': [0.0]}},
-     'frequency_hz is missing'),
+     {'name': 'frequency_hz'}),
     ({'wheel_angle': {'flywheels': ['flywheel_c', 'flywheel_a'], 'amplitude': [1.0, 1.0],
                       'frequency_hz': [1.0, 1.0], 'phase': [0.0, 0.0]}, 'motor_torque': {
         'amplitude': [1.0, 0.0, 0.0, 0.0], 'frequency_hz': [1.0] * 4, 'phase': [0.0] * 4}},
-     'flywheel_a has a prescribed angle and a motor torque: only one of the two can be given'),
-    ({'motor_torque': None}, 'motor_torque is missing or is not an object'),
+     {'name': 'flywheel_a'}),
+    ({'motor_torque': None}, {'name': 'motor_torque', 'value': None}),
     ({'motor_torque': None, 'wheel_angle': {'flywheels': ['flywheel_a'], **COSINE}},
-     'motor_torque is missing or is not an object'),
+     {'name': 'motor_torque'}),
     ({'motor_torque': {'amplitude': [1.0] * 3, 'frequency_hz': [1.0] * 4, 'phase': [0.0] * 4}},
-     'amplitude must be 4 numbers, in the order link_a, link_b, link_c, link_d, got shape (3,)'),
+     {'name': 'amplitude', 'value': 3, 'limit': 4}),
     ({'motor_torque': {'amplitude': ['1'] * 4, 'frequency_hz': [1.0] * 4, 'phase': [0.0] * 4}},
-     "amplitude must hold numbers, got ['1', '1', '1', '1']"),
+     {'name': 'amplitude.flywheel_a', 'value': '1'}),
     ({'motor_torque': {'amplitude': [True] * 4, 'frequency_hz': [1.0] * 4, 'phase': [0.0] * 4}},
-     'amplitude must hold numbers, got [True, True, True, True]'),
-    ({'initial': None}, 'initial is missing or is not an object'),
-    ({'initial': {}}, 'link_angles is missing'),
+     {'name': 'amplitude.flywheel_a', 'value': True}),
+    ({'initial': None}, {'name': 'initial'}),
+    ({'initial': {}}, {'name': 'link_angles'}),
     ({'initial': {'link_angles': [0.0, 1.0, 0.1, 1.0]}},
-     'initial: the link angles do not close the loop: gap 0.01 m, limit 1e-07 m'),
+     {'name': 'link_angles', 'value': pytest.approx(0.01, rel=1e-3), 'limit': 1e-7}),
     ({'initial': {'link_angles': [0.0, 1.0, 0.0, 1.0], 'link_rates': [0.0, 1.0, 0.0, 0.0]}},
-     'initial: the link rates do not keep the loop closed: joint 3 would open at 0.1 m/s, limit '
-     '1e-07 m/s'),
-    ({'initial': {'link_angles': [0.0, 1.0, 0.0, float('nan')]}},
-     'link_angles must be finite, got nan'),
+     {'name': 'link_rates', 'value': pytest.approx(0.1), 'limit': 1e-7}),
+    ({'initial': {'link_angles': [0.0, 1.0, 0.0, nan]}},
+     {'name': 'link_angles.link_d', 'value': pytest.approx(nan, nan_ok=True)}),
     ({'initial': {'link_angles': [0.0, 1.0, 0.0, 1.0],
                   'flywheel_speeds_absolute': [0.0] * 5}},
-     'flywheel_speeds_absolute must be 4 numbers'),
-    ({'t': None}, 't is missing'),
-    ({'t': [0.0]}, 't must hold at least two increasing times'),
-    ({'t': []}, 't must hold'),
-    ({'t': [0.0, 1.0, 1.0]}, 't must hold at least two increasing times'),
-    ({'t': [[0.0], [1.0]]}, 't must be a list, got shape (2, 1)'),
-    ({'t': [0.0, float('inf')]}, 't must be finite, got inf'),
-    ({'mechanism': 'paper'}, 'mechanism is missing or is not an object'),
+     {'name': 'flywheel_speeds_absolute', 'value': 5, 'limit': 4}),
+    ({'t': None}, {'name': 't', 'value': None}),
+    ({'t': [0.0]}, {'name': 't'}),
+    ({'t': []}, {'name': 't'}),
+    ({'t': [0.0, 1.0, 1.0]}, {'name': 't'}),
+    ({'t': [[0.0], [1.0]]}, {'name': 't.0', 'value': [0.0]}),
+    ({'t': [0.0, inf]}, {'name': 't.1', 'value': inf}),
+    ({'mechanism': 'paper'}, {'name': 'mechanism', 'value': 'paper'}),
 ])
 def test_bad_files_are_refused(
-    changes: dict[str, Any], message: str, write: Callable[..., Path],
+    changes: dict[str, Any], values: dict[str, Any], write: Callable[..., Path], refuses: Refuses,
 ) -> None:
-    """In one line that names the file and what is wrong in it."""
     path = write(**changes)
-    with pytest.raises(CaseError) as refusal:
+    with refuses(CaseError, place=str(path), **values):
         load_case(path)
-    assert message in str(refusal.value)
-    assert str(refusal.value).startswith(f'{path}: ')
-    assert '\n' not in str(refusal.value)
 
 
-def test_torque_on_one_of_four_prescribed_wheels_is_refused(write: Callable[..., Path]) -> None:
+def test_torque_on_one_of_four_prescribed_wheels_is_refused(
+    write: Callable[..., Path], refuses: Refuses,
+) -> None:
     """As it is with three."""
     cosine = {name: value * 4 for name, value in COSINE.items()}
-    angle = {'flywheels': [f'flywheel_{letter}' for letter in 'abcd'], **cosine}
+    angle = {'flywheels': list(FLYWHEEL_NAMES), **cosine}
     torque = {**cosine, 'amplitude': [0.0, 1.0, 0.0, 0.0]}
-    with pytest.raises(CaseError, match='flywheel_b has a prescribed angle and a motor torque'):
+    with refuses(CaseError, name='flywheel_b'):
         load_case(write(wheel_angle=angle, motor_torque=torque))
 
 
-@pytest.mark.parametrize('text', ['', '{', '{"t": [0, 1}', '[1, 2', 'mechanism: paper'])
-def test_what_is_no_json_is_refused(tmp_path: Path, text: str) -> None:
-    path = tmp_path / 'case.json'
-    path.write_text(text)
-    with pytest.raises(CaseError, match=r'case\.json is not JSON, or is cut: '):
-        load_case(path)
-
-
-@pytest.mark.parametrize('content', [b'\xff\xfe\x00', b'\x80abc'])
-def test_what_is_no_text_is_refused(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize('content', [
+    b'', b'{', b'{"t": [0, 1}', b'[1, 2', b'mechanism: paper', b'\xff\xfe\x00', b'\x80abc'])
+def test_file_that_is_not_json_is_refused(
+    tmp_path: Path, content: bytes, refuses: Refuses,
+) -> None:
     path = tmp_path / 'case.json'
     path.write_bytes(content)
-    with pytest.raises(CaseError, match=r'case\.json is not JSON'):
+    with refuses(CaseError, file=str(path)):
         load_case(path)
 
 
-@pytest.mark.parametrize('text', ['[]', '3', '"case"', 'null'])
-def test_what_is_no_object_is_refused(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize(('text', 'value'), [('[]', []), ('3', 3), ('"case"', 'case'),
+                                             ('null', None)])
+def test_file_without_an_object_is_refused(
+    tmp_path: Path, text: str, value: Any, refuses: Refuses,
+) -> None:
     path = tmp_path / 'case.json'
     path.write_text(text)
-    with pytest.raises(CaseError, match=r'case\.json: must hold a JSON object'):
+    with refuses(CaseError, place=str(path), value=value, limit=dict):
         load_case(path)
 
 
-def test_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CaseError, match=r'cannot read .*nowhere\.json: No such file'):
-        load_case(tmp_path / 'nowhere.json')
+def test_missing_file_and_folder_are_refused(tmp_path: Path, refuses: Refuses) -> None:
+    for path in (tmp_path / 'nowhere.json', tmp_path):
+        with refuses(CaseError, file=str(path)):
+            load_case(path)
 
 
-def test_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CaseError, match='cannot read .*: Is a directory'):
-        load_case(tmp_path)
-
-
-def test_impossible_mechanism_is_refused_with_the_file(write: Callable[..., Path]) -> None:
+def test_impossible_mechanism_is_refused_with_the_file(
+    write: Callable[..., Path], refuses: Refuses,
+) -> None:
     path = write()
     values = json.loads(path.read_text())
     values['mechanism']['link_masses'][2] = -1.0
-    with pytest.raises(MechanismError) as refusal:
+    with refuses(CaseError, name='link_masses.link_c', value=-1.0):
         load_case(write(**values))
-    assert str(refusal.value) == (
-        f'{path}, mechanism: link_masses of link_c must be positive, got -1')
 
 
-@pytest.mark.parametrize('error', [CaseError, ClosureError, MechanismError])
-def test_errors_are_those_of_the_package(error: type[Exception]) -> None:
-    assert issubclass(error, FourbarError)
-
-
-def test_motion_beyond_the_finite_numbers_is_refused(write: Callable[..., Path]) -> None:
+def test_motion_beyond_the_finite_numbers_is_refused(
+    write: Callable[..., Path], refuses: Refuses,
+) -> None:
     torque = {'amplitude': [1e200] * 4, 'frequency_hz': [0.0] * 4, 'phase': [0.0] * 4}
     case = load_case(write(motor_torque=torque))
-    with pytest.raises(CaseError, match='the motion is no longer finite at t = 0.5 s: torques '
-                                        'too large for a step of 0.001 s'):
+    with refuses(CaseError, step=1e-3):
         simulate(case)
 
 
-@pytest.mark.parametrize(('angles', 'rates', 'message'), [
-    ([0.0, 1.0, 0.0, 2.0], NONE, 'gap 0.0959 m, limit 1e-07 m'),
-    ([0.0, 1.0, 0.0, 1.0], [0.0, 1.0, 0.0, 0.0], 'open at 0.1 m/s, limit 1e-07 m/s'),
-    ([0.0, 1.0, 0.0, 1.0], [0.0, 0.0, np.inf, 0.0], 'rate of link_c must be finite, got inf'),
-    ([0.0, np.nan, 0.0, 1.0], NONE, 'angle of link_b must be finite, got nan'),
+@pytest.mark.parametrize(('angles', 'rates', 'name'), [
+    ([0.0, 1.0, 0.0, 2.0], NONE, 'link_angles'),
+    ([0.0, 1.0, 0.0, 1.0], [0.0, 1.0, 0.0, 0.0], 'link_rates'),
+    ([0.0, 1.0, 0.0, 1.0], [0.0, 0.0, inf, 0.0], 'link_rates.link_c'),
+    ([0.0, nan, 0.0, 1.0], NONE, 'link_angles.link_b'),
 ])
-def test_states_that_cannot_be_are_refused(angles: Any, rates: Any, message: str) -> None:
+def test_impossible_states_are_refused(
+    angles: Any, rates: Any, name: str, refuses: Refuses,
+) -> None:
     case = Case(load_mechanism('paper'), np.array(angles), np.array(rates), NONE, NONE, NONE,
                 NONE, np.array([0.0, 1.0]))
-    with pytest.raises(ClosureError, match=message):
+    with refuses(ClosureError, name=name):
         simulate(case)
-
-
-def test_motion_tells_its_branches() -> None:
-    """Pairs that turn apart from a fold leave the change point on the folded branch."""
-    case = Case(load_mechanism('paper'), NONE, np.array([1.0, 1.0, -1.0, -1.0]), NONE, NONE, NONE,
-                NONE, np.linspace(0.0, 1.0, 5))
-    assert simulate(case).branches() == [(0.0, 'open'), (0.25, 'folded')]

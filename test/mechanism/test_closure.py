@@ -3,6 +3,8 @@
 
 """The loop closes on both branches, from any two links, and continues across +-pi."""
 
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from itertools import combinations
 from math import acos, inf, isclose, pi
 
@@ -31,6 +33,7 @@ from numpy.typing import NDArray
 import pytest
 
 Array = NDArray[np.float64]
+Refuses = Callable[..., AbstractContextManager[None]]
 PAIRS = tuple(combinations(range(4), 2))
 
 # Angles up to 10 rad and lengths up to 0.5 m carry rounding of 2e-15 rad and 1e-16 m, an arc
@@ -186,31 +189,27 @@ def test_branches_meet_where_the_parallelogram_is_folded(theta: float, branch: s
     assert distance(angles[2:], angles[:2]) < 1e-7
 
 
-def test_unknown_branch_is_refused() -> None:
-    with pytest.raises(ClosureError, match="unknown branch 'folded' .known are open, crossed."):
+def test_unknown_branch_is_refused(refuses: Refuses) -> None:
+    with refuses(ClosureError, name='branch', value='folded', limit=BRANCHES):
         assemble(linkage((0.1,) * 4), 0.0, 1.0, 'folded')
 
 
-def test_configuration_out_of_reach_is_refused() -> None:
-    with pytest.raises(ClosureError) as refusal:
+def test_configuration_out_of_reach_is_refused(refuses: Refuses) -> None:
+    with refuses(ClosureError, value=0.6, limit=(0.0, 0.2)):
         assemble(linkage((0.3, 0.3, 0.1, 0.1)), 0.0, pi)
-    assert str(refusal.value) == (
-        'the loop cannot close at link_a = 0.0000 rad and link_b = 3.1416 rad: '
-        'link_c and link_d reach 0 to 0.2 m, needed are 0.6 m')
 
 
 @pytest.mark.parametrize(('pair', 'names'), [
-    ((0, 2), 'link_a = 0.5000 rad and link_c = 0.5000 rad'),
-    ((1, 3), 'link_b = 0.5000 rad and link_d = 0.5000 rad')])
+    ((0, 2), ('link_a', 'link_c')), ((1, 3), ('link_b', 'link_d'))])
 def test_opposite_links_of_a_parallelogram_do_not_determine_it(
-    pair: tuple[int, int], names: str,
+    pair: tuple[int, int], names: tuple[str, str], refuses: Refuses,
 ) -> None:
-    with pytest.raises(ClosureError, match=f'{names} do not determine the configuration'):
+    with refuses(ClosureError, undetermined=names):
         solve_pair(linkage((0.15, 0.08, 0.15, 0.08)), pair, (0.5, 0.5))
 
 
-def test_folded_rhombus_is_not_determined_by_a_and_b() -> None:
-    with pytest.raises(ClosureError, match='do not determine the configuration'):
+def test_folded_rhombus_is_not_determined_by_a_and_b(refuses: Refuses) -> None:
+    with refuses(ClosureError, undetermined=('link_a', 'link_b')):
         assemble(linkage((0.1,) * 4), 0.5, 0.5)
 
 
@@ -271,11 +270,14 @@ def test_path_is_followed_as_step_by_step(
         np.testing.assert_allclose(followed[n], angles, rtol=0.0, atol=20.0 * EXACT)
 
 
-def test_path_that_opens_the_loop_is_refused_where_it_does() -> None:
+def test_path_that_opens_the_loop_is_refused_where_it_does(refuses: Refuses) -> None:
     mechanism = linkage((0.3, 0.2, 0.2, 0.2))
     start = assemble(mechanism, 0.0, 1.0)
-    with pytest.raises(ClosureError, match=r'cannot close at link_a = 0\.0000 rad'):
-        assemble_along(mechanism, np.zeros(50), np.linspace(1.0, pi, 50), start)
+    path = np.linspace(1.0, pi, 50)
+    gaps = np.hypot(0.3 - 0.2 * np.cos(path), 0.2 * np.sin(path))
+    first = float(gaps[np.argmax(gaps > 0.4)])
+    with refuses(ClosureError, value=pytest.approx(first, rel=1e-12), limit=(0.0, 0.4)):
+        assemble_along(mechanism, np.zeros(50), path, start)
 
 
 # --- Folded -----------------------------------------------------------------------------------
@@ -317,6 +319,15 @@ def test_motion_on_the_closure_is_accepted(
     check_motion(mechanism, angles, [*rates, *(gamma @ rates)])
 
 
+@contextmanager
+def refused_by(gap: float, limit: float) -> Iterator[None]:
+    """Expect a refusal with these values, in three digits."""
+    with pytest.raises(ClosureError) as refusal:
+        yield
+    values = refusal.value.values
+    assert (values['value'], values['limit']) == pytest.approx((gap, limit), rel=6e-3)
+
+
 @given(phi_a=st.floats(-10.0, 10.0), theta=st.floats(0.1, 3.0), link=st.sampled_from(range(4)))
 @repeatable
 def test_gap_is_accepted_up_to_its_limit(phi_a: float, theta: float, link: int) -> None:
@@ -325,7 +336,7 @@ def test_gap_is_accepted_up_to_its_limit(phi_a: float, theta: float, link: int) 
     angles = assemble(mechanism, phi_a, phi_a + theta)
     turned = np.eye(4)[link] * TOLERANCE
     check_motion(mechanism, angles + 0.99 * turned, np.zeros(4))
-    with pytest.raises(ClosureError, match='do not close the loop: gap 1.01e-07 m, limit 1e-07 m'):
+    with refused_by(1.01e-7, 1e-7):
         check_motion(mechanism, angles + 1.01 * turned, np.zeros(4))
 
 
@@ -337,28 +348,28 @@ def test_opening_is_accepted_up_to_its_limit(phi_a: float, theta: float, link: i
     angles = assemble(mechanism, phi_a, phi_a + theta)
     faster = np.eye(4)[link] * TOLERANCE
     check_motion(mechanism, angles, 3.0 + 0.99 * faster)
-    with pytest.raises(ClosureError, match=(
-            'do not keep the loop closed: joint 3 would open at 1.01e-07 m/s, limit 1e-07 m/s')):
+    with refused_by(1.01e-7, 1e-7):
         check_motion(mechanism, angles, 3.0 + 1.01 * faster)
 
 
 def test_limit_is_relative_to_the_longest_link() -> None:
     mechanism = linkage((40.0, 10.0, 40.0, 10.0))
     angles = assemble(mechanism, 0.0, 1.0)
-    with pytest.raises(ClosureError, match='gap 0.1 m, limit 4e-05 m'):
+    with refused_by(0.1, 4e-5):
         check_motion(mechanism, angles + [0.0, 0.01, 0.0, 0.0], np.zeros(4))
 
 
 @pytest.mark.parametrize('value', [np.nan, inf, -inf])
 @pytest.mark.parametrize('link', range(4))
-def test_state_that_is_not_finite_is_refused_with_the_link(link: int, value: float) -> None:
+def test_state_that_is_not_finite_is_refused_with_the_link(
+    link: int, value: float, refuses: Refuses,
+) -> None:
     mechanism = linkage((0.1,) * 4)
     sound, broken = np.array([0.0, 1.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0, 1.0])
     broken[link] = value
     name = f'link_{"abcd"[link]}'
-    with pytest.raises(ClosureError) as refusal:
-        check_motion(mechanism, broken, np.zeros(4))
-    assert str(refusal.value) == f'the angle of {name} must be finite, got {value} rad'
-    with pytest.raises(ClosureError) as refusal:
-        check_motion(mechanism, sound, broken)
-    assert str(refusal.value) == f'the rate of {name} must be finite, got {value} rad/s'
+    for place, angles, rates in (('link_angles', broken, np.zeros(4)),
+                                 ('link_rates', sound, broken)):
+        same = pytest.approx(value, nan_ok=True)
+        with refuses(ClosureError, name=f'{place}.{name}', value=same):
+            check_motion(mechanism, angles, rates)

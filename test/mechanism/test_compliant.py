@@ -11,6 +11,13 @@ from fourbar_ros.mechanism import assemble, branch_of, Mechanism, reduced_form
 from fourbar_ros.mechanism.compliant import RESOLUTION
 from fourbar_ros.mechanism.forces import NOTHING
 from fourbar_ros.mechanism.integration import move_held, move_with_cosines
+from fourbar_ros.mechanism.momentum import (
+    body_motion,
+    joint_gaps,
+    linear_momentum,
+    mechanical_energy,
+    total_angular_momentum,
+)
 from fourbar_ros.mechanism.state import (
     CENTRE_POSITION,
     CENTRE_REST,
@@ -22,13 +29,6 @@ from fourbar_ros.mechanism.state import (
     make_state,
     WHEEL_ANGLES,
     WHEEL_SPEEDS,
-)
-from fourbar_ros.mechanism.totals import (
-    body_motion,
-    joint_gaps,
-    linear_momentum,
-    mechanical_energy,
-    total_angular_momentum,
 )
 import numpy as np
 from numpy.typing import NDArray

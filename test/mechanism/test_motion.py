@@ -17,6 +17,7 @@ from fourbar_ros.mechanism import (
 from fourbar_ros.mechanism.dynamics import mass_matrix
 from fourbar_ros.mechanism.forces import NOTHING
 from fourbar_ros.mechanism.integration import move_held, move_with_cosines
+from fourbar_ros.mechanism.momentum import linear_momentum
 from fourbar_ros.mechanism.state import (
     CENTRE_POSITION,
     CENTRE_VELOCITY,
@@ -26,7 +27,6 @@ from fourbar_ros.mechanism.state import (
     WHEEL_ANGLES,
     WHEEL_SPEEDS,
 )
-from fourbar_ros.mechanism.totals import linear_momentum
 import numpy as np
 from numpy.typing import NDArray
 import pytest

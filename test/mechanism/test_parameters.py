@@ -1,18 +1,22 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A mechanism is checked when it is made, cannot change afterwards, and says what is wrong."""
+"""A mechanism is checked when it is made and cannot change afterwards."""
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import FrozenInstanceError
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
 from fourbar_ros.common.config_files import ConfigurationError
-from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.settings import SettingError
 from fourbar_ros.mechanism import LINK_NAMES, load_mechanism, Mechanism, MechanismError
 import numpy as np
 import pytest
 
+Refuses = Callable[..., AbstractContextManager[None]]
 POSITIVE = (
     'link_lengths', 'link_masses', 'link_inertias', 'flywheel_inertias', 'motor_torque_limits',
     'motor_speed_limits')
@@ -77,25 +81,30 @@ def test_motors_are_unlimited_by_default() -> None:
 @pytest.mark.parametrize('value', [0.0, -0.5])
 @pytest.mark.parametrize('link', range(4))
 @pytest.mark.parametrize('name', POSITIVE)
-def test_value_that_is_not_positive_is_refused(name: str, link: int, value: float) -> None:
-    with pytest.raises(MechanismError) as refusal:
+def test_value_that_is_not_positive_is_refused(
+    name: str, link: int, value: float, refuses: Refuses,
+) -> None:
+    with refuses(SettingError, name=f'{name}.{LINK_NAMES[link]}', value=value, limit=(0.0, inf)):
         Mechanism(**with_one(name, link, value))
-    assert f'{name} of {LINK_NAMES[link]} must be positive, got {value:g}' in str(refusal.value)
 
 
-@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize('value', [nan, inf, -inf])
 @pytest.mark.parametrize('link', range(4))
 @pytest.mark.parametrize('name', FINITE)
-def test_value_that_is_not_finite_is_refused(name: str, link: int, value: float) -> None:
-    with pytest.raises(MechanismError) as refusal:
+def test_value_that_is_not_finite_is_refused(
+    name: str, link: int, value: float, refuses: Refuses,
+) -> None:
+    place = f'{name}.{LINK_NAMES[link]}' + ('.x' if name == 'com_positions' else '')
+    with refuses(SettingError, name=place, value=pytest.approx(value, nan_ok=True)):
         Mechanism(**with_one(name, link, value))
-    assert f'{name} of {LINK_NAMES[link]} must be finite, got {value}' in str(refusal.value)
 
 
-@pytest.mark.parametrize('value', [np.nan, -np.inf])
+@pytest.mark.parametrize('value', [nan, -inf])
 @pytest.mark.parametrize('name', ['motor_torque_limits', 'motor_speed_limits'])
-def test_motor_limit_may_be_infinite_but_not_undefined(name: str, value: float) -> None:
-    with pytest.raises(MechanismError, match=f'{name} of link_c must be finite, got {value}'):
+def test_motor_limit_may_be_infinite_but_not_undefined(
+    name: str, value: float, refuses: Refuses,
+) -> None:
+    with refuses(SettingError, name=f'{name}.link_c', value=value):
         Mechanism(**with_one(name, 2, value))
 
 
@@ -110,68 +119,66 @@ def test_sensors_have_no_offset_by_default() -> None:
     np.testing.assert_array_equal(Mechanism(**values).link_angle_offsets, np.zeros(4))
 
 
-def test_offset_of_a_sensor_may_be_negative_but_must_be_known() -> None:
+def test_offset_of_a_sensor_may_be_negative_but_must_be_known(refuses: Refuses) -> None:
     offsets = [0.01, -0.02, 0.0, 3.0]
     values = described(link_angle_offsets=offsets)
     np.testing.assert_array_equal(
         Mechanism.from_mapping(values, 'file').link_angle_offsets, offsets)
-    for value in (np.nan, np.inf, -np.inf):
-        with pytest.raises(MechanismError, match='link_angle_offsets of link_b must be finite'):
+    for value in (nan, inf, -inf):
+        with refuses(SettingError, name='link_angle_offsets.link_b', value=value):
             Mechanism(**described(link_angle_offsets=[0.0, value, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize('link', range(4))
 @pytest.mark.parametrize('excess', [0.0, 0.05])
-def test_lengths_that_cannot_close_are_refused(link: int, excess: float) -> None:
+def test_lengths_that_cannot_close_are_refused(
+    link: int, excess: float, refuses: Refuses,
+) -> None:
     lengths = np.full(4, 0.125)     # a power of two, so that three of them add up exactly
     lengths[link] = 0.375 + excess
-    with pytest.raises(MechanismError) as refusal:
+    with refuses(MechanismError, name=f'link_lengths.{LINK_NAMES[link]}',
+                 value=float(lengths[link]), limit=0.375):
         Mechanism(**described(link_lengths=lengths))
-    assert str(refusal.value) == (
-        f'link_lengths cannot close: {LINK_NAMES[link]} is {lengths[link]:g} m long, '
-        'the other three reach 0.375 m')
 
 
-@pytest.mark.parametrize(('name', 'value', 'got'), [
-    ('link_masses', 0.02, '()'),
-    ('link_masses', [0.02] * 3, '(3,)'),
-    ('link_masses', [[0.02] * 4], '(1, 4)'),
-    ('com_positions', [0.05] * 4, '(4,)'),
-    ('com_positions', [[0.05, 0.0, 0.0]] * 4, '(4, 3)'),
+@pytest.mark.parametrize(('name', 'value', 'values'), [
+    ('link_masses', 0.02, {'name': 'link_masses', 'value': 0.02, 'limit': list}),
+    ('link_masses', [0.02] * 3, {'name': 'link_masses', 'value': 3, 'limit': 4}),
+    ('link_masses', [[0.02] * 4], {'name': 'link_masses', 'value': 1, 'limit': 4}),
+    ('com_positions', [0.05] * 4, {'name': 'com_positions.link_a', 'value': 0.05}),
+    ('com_positions', [[0.05, 0.0, 0.0]] * 4,
+     {'name': 'com_positions.link_a', 'value': 3, 'limit': 2}),
 ])
-def test_wrong_shape_is_refused(name: str, value: Any, got: str) -> None:
-    with pytest.raises(MechanismError) as refusal:
+def test_wrong_shape_is_refused(
+    name: str, value: Any, values: dict[str, Any], refuses: Refuses,
+) -> None:
+    with refuses(SettingError, **values):
         Mechanism(**described(**{name: value}))
-    expected = '(4, 2)' if name == 'com_positions' else '(4,)'
-    assert str(refusal.value) == f'{name} must have shape {expected}, got {got}'
 
 
-@pytest.mark.parametrize('value', ['heavy', [0.02, 0.02, 0.02, 'heavy'], {'a': 0.02},
-                                   [[0.02, 0.02], 0.02, 0.02, 0.02]])
-def test_what_is_no_number_is_refused(value: Any) -> None:
-    with pytest.raises(MechanismError, match='link_masses must hold numbers, got'):
+@pytest.mark.parametrize(('value', 'name'), [
+    ('heavy', 'link_masses'), ([0.02, 0.02, 0.02, 'heavy'], 'link_masses.link_d'),
+    ({'a': 0.02}, 'link_masses'), ([[0.02, 0.02], 0.02, 0.02, 0.02], 'link_masses.link_a')])
+def test_value_that_is_no_number_is_refused(value: Any, name: str, refuses: Refuses) -> None:
+    with refuses(SettingError, name=name):
         Mechanism(**described(link_masses=value))
 
 
-def test_errors_are_those_of_the_package() -> None:
-    assert issubclass(MechanismError, FourbarError)
-
-
 @pytest.mark.parametrize('name', REQUIRED)
-def test_missing_key_is_named_with_its_file(name: str) -> None:
+def test_missing_key_is_named_with_its_file(name: str, refuses: Refuses) -> None:
     values = described()
     del values[name]
-    with pytest.raises(MechanismError, match=f'^bench.yaml: {name} missing$'):
+    with refuses(MechanismError, missing=[name], place='bench.yaml'):
         Mechanism.from_mapping(values, 'bench.yaml')
 
 
-def test_unknown_key_is_named_with_its_file() -> None:
-    with pytest.raises(MechanismError, match='^bench.yaml: unknown link_length [(]known are com'):
+def test_unknown_key_is_named_with_its_file(refuses: Refuses) -> None:
+    with refuses(MechanismError, unknown=['link_length'], place='bench.yaml'):
         Mechanism.from_mapping(described(link_length=[0.1] * 4), 'bench.yaml')
 
 
-def test_refused_value_is_told_with_its_file() -> None:
-    with pytest.raises(MechanismError, match='^bench.yaml: link_masses of link_b must be posi'):
+def test_refused_value_is_named_with_its_file(refuses: Refuses) -> None:
+    with refuses(MechanismError, name='link_masses.link_b', value=-1.0, place='bench.yaml'):
         Mechanism.from_mapping(with_one('link_masses', 1, -1.0), 'bench.yaml')
 
 
@@ -184,8 +191,8 @@ def test_paper_preset_is_the_linkage_of_section_3() -> None:
     np.testing.assert_array_equal(mechanism.flywheel_inertias, [3.4e-7] * 4)
 
 
-def test_missing_preset_is_refused_with_those_there_are() -> None:
-    with pytest.raises(ConfigurationError, match="'papre'.*paper"):
+def test_missing_preset_is_refused() -> None:
+    with pytest.raises(ConfigurationError):
         load_mechanism('papre')
 
 
@@ -196,11 +203,11 @@ def test_mechanism_is_read_from_a_file(tmp_path: Path) -> None:
         load_mechanism(str(file)).com_positions, described()['com_positions'])
 
 
-def test_refusal_of_a_file_names_the_file(tmp_path: Path) -> None:
+def test_refusal_of_a_file_names_the_file(tmp_path: Path, refuses: Refuses) -> None:
     file = tmp_path / 'bench.yaml'
     values = described(link_masses=[0.02, 0.02, 0.02, 0.0])
     file.write_text('\n'.join(f'{name}: {value}' for name, value in values.items()))
-    with pytest.raises(MechanismError, match='bench.yaml: link_masses of link_d must be positive'):
+    with refuses(MechanismError, name='link_masses.link_d', value=0.0, place=str(file)):
         load_mechanism(str(file))
 
 
@@ -230,61 +237,62 @@ def test_total_mass_is_that_of_the_four_links() -> None:
     assert Mechanism(**described()).constants.total_mass == pytest.approx(0.09, rel=1e-15)
 
 
-@pytest.mark.parametrize(('changes', 'message'), [
-    ({'joint_stiffness': [1e4, 1e4, np.inf, 1e4]},
-     'joint_stiffness of joint 3 is infinite and that of joint 1 is not: give all four, or none'),
-    ({'joint_stiffness': [np.inf, np.inf, 1e4, np.inf]},
-     'joint_stiffness of joint 1 is infinite and that of joint 3 is not: give all four, or none'),
-    ({'joint_stiffness': [1e4, 0.0, 1e4, 1e4]},
-     'joint_stiffness of joint 2 must be positive, got 0'),
-    ({'joint_stiffness': [-1e4, 1e4, 1e4, 1e4]},
-     'joint_stiffness of joint 1 must be positive, got -10000'),
-    ({'joint_stiffness': [1e4, 1e4, 1e4, np.nan]},
-     'joint_stiffness of joint 4 must be finite, got nan'),
-    ({'joint_stiffness': [-np.inf] * 4}, 'joint_stiffness of joint 1 must be finite, got -inf'),
-    ({'joint_stiffness': 1e4}, 'joint_stiffness must have shape (4,), got ()'),
-    ({'motor_time_constants': [0.0, -1e-3, 0.0, 0.0]},
-     'motor_time_constants of link_b must not be negative, got -0.001'),
-    ({'motor_resistances': [0.0, 0.0, np.inf, 0.0]},
-     'motor_resistances of link_c must be finite, got inf'),
-    ({'motor_voltages': [np.inf, 12.0, np.inf, np.inf]},
-     'motor_resistances or motor_voltages of link_b is given: give motor_torque_constants too'),
-    ({'motor_resistances': [0.0, 0.0, 1.0, 0.0]},
-     'motor_resistances or motor_voltages of link_c is given: give motor_torque_constants too'),
-    ({'motor_voltages': [12.0] * 4, 'motor_torque_constants': [0.03] * 4},
-     'motor_voltages of link_a is given: give motor_resistances too'),
-    ({'motor_torque_constants': [0.0, 1.0, 1.0, 1.0]},
-     'motor_torque_constants of link_a must be positive, got 0'),
-    ({'motor_voltages': [12.0, 12.0, 12.0, np.nan]},
-     'motor_voltages of link_d must be finite, got nan'),
+@pytest.mark.parametrize(('changes', 'name'), [
+    ({'joint_stiffness': [1e4, 1e4, inf, 1e4]}, 'joint_stiffness.joint_3'),
+    ({'joint_stiffness': [inf, inf, 1e4, inf]}, 'joint_stiffness.joint_1'),
+    ({'joint_stiffness': [1e4, 0.0, 1e4, 1e4]}, 'joint_stiffness.joint_2'),
+    ({'joint_stiffness': [-1e4, 1e4, 1e4, 1e4]}, 'joint_stiffness.joint_1'),
+    ({'joint_stiffness': [1e4, 1e4, 1e4, nan]}, 'joint_stiffness.joint_4'),
+    ({'joint_stiffness': [-inf] * 4}, 'joint_stiffness.joint_1'),
+    ({'joint_stiffness': 1e4}, 'joint_stiffness'),
+    ({'motor_time_constants': [0.0, -1e-3, 0.0, 0.0]}, 'motor_time_constants.link_b'),
+    ({'motor_resistances': [0.0, 0.0, inf, 0.0]}, 'motor_resistances.link_c'),
+    ({'motor_torque_constants': [0.0, 1.0, 1.0, 1.0]}, 'motor_torque_constants.link_a'),
+    ({'motor_voltages': [12.0, 12.0, 12.0, nan]}, 'motor_voltages.link_d'),
     ({'joint_stiffness': [1e4] * 4, 'joint_damping': [0.0, 0.0, -1.0, 0.0]},
-     'joint_damping of joint 3 must not be negative, got -1'),
-    ({'joint_stiffness': [1e4] * 4, 'joint_damping': [0.0, np.inf, 0.0, 0.0]},
-     'joint_damping of joint 2 must be finite, got inf'),
-    ({'joint_stiffness': [1e4] * 4, 'joint_damping': [1.0] * 3},
-     'joint_damping must have shape (4,), got (3,)'),
-    ({'joint_damping': [0.0, 1.0, 0.0, 0.0]},
-     'joint_damping of joint 2 is given, but the joints are rigid: give joint_stiffness too'),
+     'joint_damping.joint_3'),
+    ({'joint_stiffness': [1e4] * 4, 'joint_damping': [0.0, inf, 0.0, 0.0]},
+     'joint_damping.joint_2'),
+    ({'joint_stiffness': [1e4] * 4, 'joint_damping': [1.0] * 3}, 'joint_damping'),
 ])
-def test_impossible_joints_are_refused(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(MechanismError) as refusal:
+def test_impossible_joints_and_windings_are_refused(
+    changes: dict[str, Any], name: str, refuses: Refuses,
+) -> None:
+    with refuses(SettingError, name=name):
         Mechanism(**described(**changes))
-    assert str(refusal.value) == message
+
+
+@pytest.mark.parametrize(('changes', 'name', 'missing'), [
+    ({'motor_voltages': [inf, 12.0, inf, inf]}, 'motor_voltages.link_b',
+     'motor_torque_constants'),
+    ({'motor_resistances': [0.0, 0.0, 1.0, 0.0]}, 'motor_resistances.link_c',
+     'motor_torque_constants'),
+    ({'motor_voltages': [12.0] * 4, 'motor_torque_constants': [0.03] * 4},
+     'motor_voltages.link_a', 'motor_resistances'),
+    ({'joint_damping': [0.0, 1.0, 0.0, 0.0]}, 'joint_damping.joint_2', 'joint_stiffness'),
+])
+def test_value_that_needs_another_is_refused(
+    changes: dict[str, Any], name: str, missing: str, refuses: Refuses,
+) -> None:
+    with refuses(MechanismError, name=name, missing=missing):
+        Mechanism(**described(**changes))
 
 
 @pytest.mark.parametrize('damping', [None, [0.0] * 4])
-def test_rigid_joints_may_be_told_too(damping: list[float] | None) -> None:
+def test_rigid_joints_may_be_written_too(damping: list[float] | None) -> None:
     given = {} if damping is None else {'joint_damping': damping}
     assert not Mechanism(**described(joint_stiffness=[np.inf] * 4, **given)).constants.compliant
 
 
-def test_joints_that_give_need_no_damping() -> None:
+def test_compliant_joints_need_no_damping() -> None:
     mechanism = Mechanism(**described(joint_stiffness=[1e4, 2e4, 3e4, 4e4]))
     np.testing.assert_array_equal(mechanism.joint_damping, [0.0] * 4)
     np.testing.assert_array_equal(mechanism.constants.joint_stiffness, [1e4, 2e4, 3e4, 4e4])
 
 
-def test_joints_are_read_from_a_file_and_refused_with_it(tmp_path: Path) -> None:
+def test_joints_are_read_from_a_file_and_refused_with_it(
+    tmp_path: Path, refuses: Refuses,
+) -> None:
     file = tmp_path / 'bench.yaml'
 
     def describe(stiffness: str) -> None:
@@ -295,7 +303,7 @@ def test_joints_are_read_from_a_file_and_refused_with_it(tmp_path: Path) -> None
     np.testing.assert_array_equal(
         load_mechanism(str(file)).joint_stiffness, [1e4, 2e4, 3e4, 4e4])
     describe('[10000.0, 20000.0, 0.0, 40000.0]')
-    with pytest.raises(MechanismError, match='bench.yaml: joint_stiffness of joint 3 must be pos'):
+    with refuses(MechanismError, name='joint_stiffness.joint_3', value=0.0, place=str(file)):
         load_mechanism(str(file))
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from fourbar_ros.mechanism import load_mechanism, Mechanism
+from fourbar_ros.mechanism.momentum import joint_gaps, linear_momentum, total_angular_momentum
 from fourbar_ros.mechanism.state import LINK_RATES
-from fourbar_ros.mechanism.totals import joint_gaps, linear_momentum, total_angular_momentum
 from fourbar_ros.plant import InitialState, load_table, Plant, PlantError, Table
 from fourbar_ros.plant.edge import joint_levers
 from fourbar_ros.plant.plant import WALKED_BEFORE

@@ -11,7 +11,7 @@ from fourbar_ros.plant import load_table, parse_fault, Plant, Table
 from fourbar_ros.plant.bearings import bearing_torque, drives_of
 from fourbar_ros.plant.faults import wheel_faults
 from fourbar_ros.plant.sensors import LinkSensorSettings
-from fourbar_ros.plant.step import Boxed, conditions_of, SOUND
+from fourbar_ros.plant.step import conditions_of, Packed, SOUND
 from fourbar_ros.plant.table import WheelBearings, WheelEncoders
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ def prototype() -> Mechanism:
     return mechanism
 
 
-def broken_b(text: str) -> Boxed:
+def broken_b(text: str) -> Packed:
     """Return the conditions where only wheel b has a fault."""
     fault = parse_fault('flywheel_b', text)
     return conditions_of(wheel_faults([fault] if fault else []))
@@ -110,7 +110,7 @@ def test_motor_without_power_is_one_that_is_asked_for_nothing(
                      conditions=runaway if powered[1] else SOUND)
         assert after(cut) == after(told), f'seed {seed}, period {period}'
         np.testing.assert_array_equal(
-            cut._motor_state, told._motor_state, f'seed {seed}, period {period}')
+            cut.motor_states, told.motor_states, f'seed {seed}, period {period}')
 
 
 def test_speed_loop_learns_anew_after_a_cut(

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from fourbar_ros.mechanism import Mechanism
-from fourbar_ros.mechanism.forces import grip
+from fourbar_ros.mechanism.forces import dry_friction
 from fourbar_ros.plant import Plant, Table
 from fourbar_ros.plant.bearings import bearing_torque, drives_of
 from fourbar_ros.plant.sensors import LinkSensorSettings
@@ -95,7 +95,7 @@ def test_friction_depends_on_the_speed_alone_and_opposes_it(bench: Mechanism) ->
     assert bearing_torque(0.0, 0.0, motors) == 0.0
     assert bearing_torque(5.0, 2e-3, motors) == pytest.approx(
         bearing_torque(5.0, 0.0, motors) + 2e-3, rel=1e-6)
-    assert grip(1e-12, 1.0, 1.0, 1e-4) == pytest.approx(1e4)
+    assert dry_friction(1e-12, 1.0, 1.0, 1e-4) == pytest.approx(1e4)
 
 
 @pytest.mark.parametrize('share', [0.5, 0.99, -0.9])

@@ -5,9 +5,8 @@
 
 from fourbar_ros.mechanism import assemble, Mechanism
 from fourbar_ros.mechanism.forces import NOTHING, surroundings
-from fourbar_ros.mechanism.integration import move_held
+from fourbar_ros.mechanism.integration import link_trajectories, move_held
 from fourbar_ros.mechanism.state import make_state
-from fourbar_ros.mechanism.tracks import link_tracks
 import numpy as np
 
 STEP, STEPS = 1e-3, 4
@@ -19,19 +18,18 @@ def test_each_motion_is_bit_for_bit_that_of_its_own(paper: Mechanism, uneven: Me
     mechanisms = [paper, uneven, paper]
     around = [NOTHING, surroundings(link_spin_drag=1e-6), surroundings(link_drag=1e-2)]
     torques = 1e-5 * generator.standard_normal((2, 25, 4))
-    chosen = np.array([1, 0, 1])
+    sequence = np.array([1, 0, 1])
     factors = generator.uniform(0.5, 2.0, (3, 4))
     states = np.array([make_state(assemble(mechanism, 0.1, 1.2)) for mechanism in mechanisms])
-    before = states.copy()
-    tracks = link_tracks(
-        states, torques, chosen, factors, STEP, STEPS,
+    trajectories = link_trajectories(
+        states.copy(), torques, sequence, factors, STEP, STEPS,
         np.array([mechanism.constants for mechanism in mechanisms]), np.array(around))
-    np.testing.assert_array_equal(states, before)
-    assert tracks.shape == (26, 3, 8)
+    assert trajectories.shape == (26, 3, 8)
     for n, mechanism in enumerate(mechanisms):
         state = states[n].copy()
-        np.testing.assert_array_equal(tracks[0, n], state[:8])
+        np.testing.assert_array_equal(trajectories[0, n], state[:8])
         for tick in range(25):
-            move_held(state, factors[n] * torques[chosen[n], tick], STEP, STEPS,
+            move_held(state, factors[n] * torques[sequence[n], tick], STEP, STEPS,
                       mechanism.constants, around[n])
-            np.testing.assert_array_equal(tracks[tick + 1, n], state[:8], err_msg=f'{n} {tick}')
+            np.testing.assert_array_equal(
+                trajectories[tick + 1, n], state[:8], err_msg=f'{n} {tick}')

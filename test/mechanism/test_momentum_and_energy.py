@@ -7,6 +7,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from fourbar_ros.mechanism import angular_momentum, kinetic_energy, Mechanism
+from fourbar_ros.mechanism.momentum import (
+    body_motion,
+    joint_gaps,
+    linear_momentum,
+    mechanical_energy,
+    total_angular_momentum,
+)
 from fourbar_ros.mechanism.state import (
     CENTRE_POSITION,
     CENTRE_VELOCITY,
@@ -16,13 +23,6 @@ from fourbar_ros.mechanism.state import (
     LINK_RATES,
     make_state,
     WHEEL_SPEEDS,
-)
-from fourbar_ros.mechanism.totals import (
-    body_motion,
-    joint_gaps,
-    linear_momentum,
-    mechanical_energy,
-    total_angular_momentum,
 )
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
