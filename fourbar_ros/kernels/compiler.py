@@ -32,14 +32,14 @@ import numpy
 
 # Kernels live in these rooms and call nothing outside them.
 ROOMS = ('kernels', 'mechanism', 'plant', 'estimation', 'control')
+# Seconds after which the code of other versions is dropped.
 UNUSED_AFTER = 30 * 24 * 3600.0
-"""Seconds after which the code of other versions is dropped."""
 
+# The parallel range of a kernel compiled with `parallel=True`.
 prange = numba.prange
-"""The parallel range of a kernel compiled with `parallel=True`."""
 
+# Value of the option `fastmath` with which a product and a sum may be rounded once.
 FUSED = {'contract'}
-"""Value of the option `fastmath` with which a product and a sum may be rounded once."""
 
 _OPTIONS = {'error_model': 'numpy', 'fastmath': False}
 _Function = TypeVar('_Function', bound=Callable[..., Any])

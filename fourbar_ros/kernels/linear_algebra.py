@@ -13,15 +13,12 @@ from math import hypot, sqrt
 
 from fourbar_ros.kernels.compiler import kernel
 
+# One component for each of the links a, b, c and d.
 Vector4 = tuple[float, float, float, float]
-"""One component for each of the links a, b, c and d."""
 
+# A lower triangular (4, 4) matrix, row by row. Functions of this module take and return Cholesky
+# factors with the inverses of the diagonal.
 Triangle = tuple[float, float, float, float, float, float, float, float, float, float]
-"""
-A lower triangular (4, 4) matrix, row by row.
-
-Functions of this module take and return Cholesky factors with the inverses of the diagonal.
-"""
 
 ZERO: Vector4 = (0.0, 0.0, 0.0, 0.0)
 

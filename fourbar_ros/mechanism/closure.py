@@ -25,14 +25,12 @@ from numpy.typing import ArrayLike
 
 BRANCHES = ('open', 'crossed')
 
+# Sign of each link in the closure written as a sum that vanishes.
 SIGNS = (-1.0, 1.0, 1.0, -1.0)
-"""Sign of each link in the closure written as a sum that vanishes."""
 
+# Largest closure error of a state, relative to the longest link, and of its rate per second: far
+# above rounded digits, far below any real mistake.
 TOLERANCE = 1e-6
-"""
-Largest closure error of a state, relative to the longest link, and of its rate per second: far
-above rounded digits, far below any real mistake.
-"""
 
 
 class ClosureError(FourbarError):

@@ -39,8 +39,8 @@ from fourbar_ros.mechanism.state import (
 )
 import numpy as np
 
+# Largest phase of the fastest motion of the joints in one step [rad].
 RESOLUTION = 0.4
-"""Largest phase of the fastest motion of the joints in one step [rad]."""
 
 # The motion of the bodies is one vector: coordinates x, y [m] and angle [rad] of each body, a to
 # d, from Q on, then their rates from V on.
@@ -53,8 +53,8 @@ Q, V = 0, BODIES
 # motion, then the coordinates at a stage, then accelerations and rates of the stages.
 STAGE_Q, FIRST_ACCELERATIONS, WORK = 2 * BODIES, 3 * BODIES, 10 * BODIES
 
+# Joints 1, 2 and 4, by which the bodies form a tree: b and d on a, and c on b.
 TREE = (0, 1, 3)
-"""Joints 1, 2 and 4, by which the bodies form a tree: b and d on a, and c on b."""
 
 
 class BodyStage(NamedTuple):

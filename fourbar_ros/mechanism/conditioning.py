@@ -25,10 +25,10 @@ from fourbar_ros.mechanism.reduced import close_loop, pair_inertias, reduced_ter
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+# Which wheels are left (11, 4): all, all but a, b, c or d, then pairs ab, ac, ad, bc, bd, cd.
 WHEELS: NDArray[np.bool_] = np.array(
     [[True] * 4, *(np.arange(4) != lost for lost in range(4)),
      *([wheel in pair for wheel in range(4)] for pair in PAIRS)])
-"""Which wheels are left (11, 4): all, all but a, b, c or d, then pairs ab, ac, ad, bc, bd, cd."""
 
 NUMBERS = 4 + len(WHEELS)
 

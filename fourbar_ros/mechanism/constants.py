@@ -23,8 +23,8 @@ PAIRS = tuple(combinations(range(4), 2))
 JOINTS = (((0, False), (1, False)), ((1, True), (2, False)),
           ((3, True), (2, True)), ((0, True), (3, False)))
 
+# Name, type and shape of the fields of a record.
 Fields = list[tuple[str, Any, tuple[int, ...]]]
-"""Name, type and shape of the fields of a record."""
 
 # The constants of the equations of motion (SI units), one record that kernels take as a whole.
 #
@@ -55,8 +55,8 @@ FIELDS: Fields = [
     ('compliant', bool, ()),                # whether the joints give
 ]
 
+# A scalar of `FIELDS`; numba knows its fields by name.
 Constants = np.record
-"""A scalar of `FIELDS`; numba knows its fields by name."""
 
 
 def record(fields: Fields, **values: Any) -> np.record:

@@ -21,6 +21,7 @@ from fourbar_ros.mechanism.mechanism import checked_array, JOINT_NAMES, LINK_NAM
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+# The effects, and the names of their elements where there are several.
 _EFFECTS = (
     (Setting('joint_coulomb', 0.0, 'N m', 'Coulomb friction torque between the links of a joint',
              low=0.0), JOINT_NAMES),
@@ -39,15 +40,14 @@ _EFFECTS = (
     (Setting('gravity', 0.0, 'm/s^2', 'acceleration along the table, by its tilt'), ('x', 'y')),
     (Setting('link_torques', 0.0, 'N m', 'constant torque on a link from outside'), LINK_NAMES),
 )
-"""The effects, and the names of their elements where there are several."""
 
+# The record of the effects; where `acting` is False they are all without effect.
 FIELDS: Fields = [
     *((row.name, float, (len(elements),) if elements else ()) for row, elements in _EFFECTS),
     ('acting', bool, ())]
-"""The record of the effects; where `acting` is False they are all without effect."""
 
+# A scalar of `FIELDS`, made by :func:`surroundings`; `NOTHING` where none acts.
 Surroundings = np.record
-"""A scalar of `FIELDS`, made by :func:`surroundings`; `NOTHING` where none acts."""
 
 
 class System(NamedTuple):

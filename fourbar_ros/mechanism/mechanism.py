@@ -28,17 +28,15 @@ LINK_NAMES = ('link_a', 'link_b', 'link_c', 'link_d')
 FLYWHEEL_NAMES = ('flywheel_a', 'flywheel_b', 'flywheel_c', 'flywheel_d')
 JOINT_NAMES = ('joint_1', 'joint_2', 'joint_3', 'joint_4')
 
+# Names of all possible sensors: of the orientation of a link, or of the angle in a joint.
 SENSOR_NAMES = (*LINK_NAMES, *JOINT_NAMES)
-"""Names of all possible sensors: of the orientation of a link, or of the angle in a joint."""
 
+# First and second link of each joint; its encoder measures the second relative to the first.
 JOINT_LINKS = ((0, 1), (1, 2), (2, 3), (3, 0))
-"""First and second link of each joint; its encoder measures the second relative to the first."""
 
+# Signs of the links that line up against the others at a change point: a and d against b and c
+# (parallelogram, theta = 0), a and b against c and d (theta = pi), a and c against b and d.
 _ALIGNMENTS = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
-"""
-Signs of the links that line up against the others at a change point: a and d against b and c
-(parallelogram, theta = 0), a and b against c and d (theta = pi), a and c against b and d.
-"""
 
 
 class MechanismError(SettingError):

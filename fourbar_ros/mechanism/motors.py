@@ -30,8 +30,8 @@ FIELDS: Fields = [
     ('inertia', float, (4,)),           # kg m^2, of the wheel
 ]
 
+# A scalar of `FIELDS`, and perhaps more; numba knows its fields by name.
 Motors = np.record
-"""A scalar of `FIELDS`, and perhaps more; numba knows its fields by name."""
 
 
 def motor_values(mechanism: Mechanism) -> dict[str, Any]:

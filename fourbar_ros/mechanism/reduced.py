@@ -36,14 +36,12 @@ from fourbar_ros.mechanism.state import (
 )
 import numpy as np
 
+# Angle up to which four terms of the series of sine and cosine are exact in double [rad].
 SMALL_TURN = 0.02
-"""Angle up to which four terms of the series of sine and cosine are exact in double [rad]."""
 
+# Largest difference between the summed angular momentum and that of the rates, relative to a turn
+# of the whole at these rates: far above rounding, far below any change of the rates from outside.
 MOMENTUM_AGREEMENT = 1e-9
-"""
-Largest difference between the summed angular momentum and that of the rates, relative to a turn of
-the whole at these rates: far above rounding, far below any change of the rates from outside.
-"""
 
 
 class LinkVectors(NamedTuple):

@@ -17,11 +17,11 @@ from fourbar_ros.mechanism.motors import FIELDS as MOTOR_FIELDS
 from fourbar_ros.mechanism.motors import motor_values, Motors
 from fourbar_ros.plant.table import WheelBearings
 
+# Newton's method converges in three or four iterations unless a number is not finite.
 MOST_ITERATIONS = 60
-"""Newton's method converges in three or four iterations unless a number is not finite."""
 
+# Share of the speed that friction may take in a step that uses the friction at its middle.
 MIDPOINT_LIMIT = 0.5
-"""Share of the speed that friction may take in a step that uses the friction at its middle."""
 
 # Those of the motors come last: numba takes a record that begins like another for one of its kind,
 # and warns.

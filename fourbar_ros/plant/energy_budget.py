@@ -16,6 +16,7 @@ from fourbar_ros.mechanism.state import JOINT_LOSS, WHEEL_SPEEDS
 import numpy as np
 from numpy.typing import NDArray
 
+# What the kernels sum, in one record.
 SUMS: Fields = [(name, float, ()) for name in (
     # Energies [J]: supplied, heat in windings, bearings and joints, taken by drag and at the edge,
     # work of the tilt and of random torques.
@@ -24,7 +25,6 @@ SUMS: Fields = [(name, float, ()) for name in (
     'drag_spin', 'edge_spin', 'disturbance_spin',
     # Number of contacts of a joint with the edge.
     'contacts')]
-"""What the kernels sum, in one record."""
 
 
 @dataclass(frozen=True)

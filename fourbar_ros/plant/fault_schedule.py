@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Which faults there are now, set by hand or by a schedule.
+The present faults, set by hand or by a schedule.
 
 A schedule is a list of entries, in a YAML file under `faults`:
 
@@ -10,8 +10,8 @@ A schedule is a list of entries, in a YAML file under `faults`:
       - {at: 2.0, until: 5.0, target: link_b, fault: wrong, value: 0.1}
       - {at: 8.0, target: flywheel_a, fault: dead}
 
-with times in simulated seconds since the start. Without `until` a fault stays, without `value` it
-has the default of its kind.
+Times are simulated seconds since the start. A fault without `until` stays; one without `value` has
+the default of its kind.
 """
 
 from __future__ import annotations
@@ -22,11 +22,15 @@ from types import MappingProxyType
 from typing import Any
 
 from fourbar_ros.common.config_files import load_yaml
-from fourbar_ros.common.settings import check_keys
+from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.settings import check_keys, Setting
 from fourbar_ros.plant.faults import Fault, fault_kinds, FaultError, parse_fault
 
+# Latest time of a schedule [s]: 30 years, which fits the integer nanoseconds of a stamp.
 LATEST_S = 1e9
-"""End of the times that a schedule may name [s]."""
+
+_TIMES = {name: Setting(name, 0.0, 's', meaning, low=0.0, high=LATEST_S)
+          for name, meaning in (('at', 'begin of the fault'), ('until', 'end of the fault'))}
 
 
 def read_schedule(path: str) -> Any:
@@ -44,10 +48,10 @@ def read_schedule(path: str) -> Any:
 @dataclass(frozen=True)
 class ScheduledFault:
     """
-    A fault with its time, since the start.
+    A fault with its times since the start.
 
-    :param at_ns: from when on [ns].
-    :param until_ns: until when, None for ever [ns].
+    :param at_ns: begin [ns].
+    :param until_ns: end, None for ever [ns].
     """
 
     fault: Fault
@@ -58,11 +62,11 @@ class ScheduledFault:
 @dataclass(frozen=True)
 class FaultChange:
     """
-    A fault that came or went.
+    The begin or end of a fault.
 
-    :param elapsed_ns: when, since the start [ns].
-    :param target: what it hits.
-    :param fault: None where it went.
+    :param elapsed_ns: its time since the start [ns].
+    :param target: sensor or wheel.
+    :param fault: None at its end.
     """
 
     elapsed_ns: int
@@ -76,31 +80,34 @@ def parse_schedule(entries: Any, targets: Sequence[str], origin: str,
     Check a schedule.
 
     :param entries: list of mappings, see the head of this module.
-    :param targets: names of the sensors and wheels that there are.
-    :param origin: where the entries come from, for messages.
+    :param targets: names of the present sensors and wheels.
+    :param origin: file or parameter of the entries, for messages.
     :param elapsed_ns: now, since the start [ns].
-    :returns: in the order given.
-    :raises FaultError: an entry means nothing, lies in the past, or overlaps with another one on
-        the same target; the message says which, counted from 1.
+    :returns: in the order of the entries.
+    :raises FaultError: an entry is invalid, lies in the past, or overlaps with another entry on
+        the same target; `values['entry']` is its number, from 1.
     """
     if isinstance(entries, (str, Mapping)) or not isinstance(entries, Sequence):
-        raise FaultError(f'{origin}: a schedule of faults must be a list, got {entries!r}')
+        raise FaultError(f'{origin}: a schedule of faults must be a list, got {entries!r}',
+                         place=origin, value=entries, limit=list)
     schedule: list[ScheduledFault] = []
     for number, entry in enumerate(entries, 1):
         place = f'{origin}, entry {number}'
         if not isinstance(entry, Mapping):
             raise FaultError(
-                f'{place} must be a mapping with at, target and fault, got {entry!r}')
+                f'{place} must be a mapping with at, target and fault, got {entry!r}',
+                place=place, entry=number, value=entry, limit=dict)
         check_keys(entry, ('at', 'target', 'fault'), place, FaultError, ('until', 'value'))
         try:
             scheduled = _parse_entry(entry, targets, elapsed_ns)
-        except FaultError as error:
-            raise FaultError(f'{place}: {error}') from None
+        except FourbarError as error:
+            raise error.at(place, FaultError) from None
         for earlier, other in enumerate(schedule, 1):
             if _overlap(scheduled, other):
                 raise FaultError(
                     f'{place}: overlaps with entry {earlier} on {scheduled.fault.target}, which '
-                    'can have one fault at a time')
+                    'can have one fault at a time', place=place, entry=number, overlaps=earlier,
+                    name=scheduled.fault.target)
         schedule.append(scheduled)
     return tuple(schedule)
 
@@ -109,7 +116,7 @@ class FaultBoard:
     """
     The faults of a testbed, at most one for each sensor and wheel.
 
-    :param targets: names of the sensors and wheels that there are.
+    :param targets: names of its sensors and wheels.
     """
 
     def __init__(self, targets: Sequence[str]) -> None:
@@ -119,14 +126,14 @@ class FaultBoard:
 
     @property
     def faults(self) -> Mapping[str, Fault]:
-        """The faults there are now, by what they hit; a view that follows the changes."""
+        """The present faults by target; a view that follows the changes."""
         return MappingProxyType(self._faults)
 
     def parse(self, target: str, text: str) -> Fault | None:
         """
-        Read a fault of something that is here, as `parse_fault` does.
+        Read a fault of a target of this testbed, as `parse_fault` does.
 
-        :raises FaultError: as there, or there is no such sensor or wheel.
+        :raises FaultError: as there, or the testbed has no such sensor or wheel.
         """
         fault = parse_fault(target, text)
         if fault is not None:
@@ -135,26 +142,27 @@ class FaultBoard:
 
     def set_fault(self, target: str, fault: Fault | None) -> None:
         """
-        Break something now, or mend it with None.
+        Set the fault of a target, None for no fault.
 
-        It counts until the next change, by hand or by the schedule. A scheduled end only takes
-        away the fault that the same entry brought.
+        The fault stays until the next change, by hand or by the schedule. A scheduled end removes
+        only the fault of its own entry.
 
-        :raises FaultError: there is no such sensor or wheel, or the fault is of another one.
+        :raises FaultError: no such sensor or wheel, or a fault of another target.
         """
         _check_target(target, self.targets)
         if fault is None:
             self._faults.pop(target, None)
         elif fault.target != target:
-            raise FaultError(f'a fault of {fault.target} cannot be one of {target}')
+            raise FaultError(f'a fault of {fault.target} cannot be set on {target}',
+                             name=target, value=fault.target)
         else:
             self._faults[target] = fault
 
     def load(self, entries: Any, origin: str, elapsed_ns: int = 0) -> None:
         """
-        Follow a schedule from now on, instead of the one so far.
+        Replace the schedule.
 
-        What the one so far has broken and would have mended later is mended now.
+        Faults of the old schedule that have not ended yet end now.
 
         :param entries, origin, elapsed_ns: see `parse_schedule`.
         :raises FaultError: the schedule is refused; then nothing was changed.
@@ -170,11 +178,11 @@ class FaultBoard:
 
     def at_time(self, elapsed_ns: int) -> tuple[FaultChange, ...]:
         """
-        Apply all that the schedule says up to a time.
+        Apply the schedule up to a time.
 
         :param elapsed_ns: since the start [ns].
-        :returns: what changed, in the order of its times; those that are due at the same time in
-            the order of the schedule, ends first.
+        :returns: the changes in the order of their times; at the same time in the order of the
+            schedule, ends first.
         """
         changes = []
         while self._scheduled and self._scheduled[0][0] <= elapsed_ns:
@@ -188,7 +196,7 @@ class FaultBoard:
         return tuple(changes)
 
     def _end(self, scheduled: ScheduledFault) -> bool:
-        """Mend what a scheduled fault broke, unless somebody else did or broke it otherwise."""
+        """Remove a scheduled fault, unless it was replaced; return whether it was removed."""
         fault = scheduled.fault
         if self._faults.get(fault.target) is not fault:
             return False
@@ -197,7 +205,7 @@ class FaultBoard:
 
 
 def _events(scheduled: ScheduledFault) -> list[tuple[int, bool, ScheduledFault]]:
-    """Return when a scheduled fault ends (False) and begins (True)."""
+    """Return the times of a scheduled fault, each with whether it begins then."""
     begin = (scheduled.at_ns, True, scheduled)
     if scheduled.until_ns is None:
         return [begin]
@@ -216,26 +224,26 @@ def _parse_entry(entry: Mapping[str, Any], targets: Sequence[str],
     # YAML reads a bare off as false.
     kind = 'off' if entry['fault'] is False else entry['fault']
     fault = Fault(entry['target'], kind, entry.get('value'))
-    at_ns = _nanoseconds('at', entry['at'])
+    at_ns = _nanoseconds('at', entry)
     if at_ns < elapsed_ns:
-        raise FaultError(f'at {entry["at"]} s lies in the past, it is {elapsed_ns * 1e-9:g} s now')
+        raise FaultError(f'at {entry["at"]} s lies in the past, now is {elapsed_ns * 1e-9:g} s',
+                         name='at', value=entry['at'], limit=elapsed_ns * 1e-9)
     if entry.get('until') is None:
         return ScheduledFault(fault, at_ns, None)
-    until_ns = _nanoseconds('until', entry['until'])
+    until_ns = _nanoseconds('until', entry)
     if until_ns <= at_ns:
-        raise FaultError(f'until {entry["until"]} s must be later than at {entry["at"]} s')
+        raise FaultError(f'until {entry["until"]} s must be later than at {entry["at"]} s',
+                         name='until', value=entry['until'], limit=entry['at'])
     return ScheduledFault(fault, at_ns, until_ns)
 
 
 def _check_target(target: Any, targets: Sequence[str]) -> None:
     fault_kinds(target)
     if target not in targets:
-        raise FaultError(f'there is no {target} here (there are {", ".join(targets)})')
+        raise FaultError(f'this testbed has no {target} (it has {", ".join(targets)})',
+                         name='target', value=target, limit=tuple(targets))
 
 
-def _nanoseconds(name: str, seconds: Any) -> int:
-    if isinstance(seconds, bool) or not isinstance(seconds, (int, float)):
-        raise FaultError(f'{name} must be a number of seconds, got {seconds!r}')
-    if not 0.0 <= seconds <= LATEST_S:
-        raise FaultError(f'{name} must be from 0 to {LATEST_S:g} s, got {seconds}')
+def _nanoseconds(name: str, entry: Mapping[str, Any]) -> int:
+    seconds: float = _TIMES[name].check(entry[name])
     return round(seconds * 1e9)

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What can break on the table: a sensor of the links, or the drive of a flywheel.
+Faults of the simulated table: of a sensor of the links, or of the drive of a flywheel.
 
-A fault hits one sensor or wheel, by its name in the topics, and there is at most one at a time on
-each.
+A fault has one target, a sensor or wheel by its name in the topics. Each target has at most one
+fault at a time.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import nan, pi
-from typing import Any
 
 from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.settings import Setting, SettingError
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, SENSOR_NAMES
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
 
 class FaultError(FourbarError):
-    """A fault that cannot be, of something that is not there, or at a time that cannot be."""
+    """A fault of an unknown kind, target, value or time."""
 
 
 @dataclass(frozen=True)
 class FaultKind:
     """
-    One way to break.
+    One kind of fault.
 
-    :param meaning: what it does, for people.
-    :param quantity: what its value is, for people; empty where it takes none.
-    :param unit: of the value, empty where it is a pure number.
-    :param default: value where none is given.
-    :param low, high: range of the value, both included.
+    :param meaning: its effect.
+    :param quantity: name of its value; empty for a fault without a value.
+    :param unit: of the value, '' for a pure number.
+    :param default: of the value.
+    :param low, high: smallest and largest value, both allowed.
     """
 
     meaning: str
@@ -45,6 +45,7 @@ class FaultKind:
     high: float = 0.0
 
 
+# Faults of a link sensor.
 SENSOR_FAULTS = {
     'off': FaultKind('gives no sample'),
     'stuck': FaultKind('repeats the last sample it gave, bit for bit, with new stamps'),
@@ -54,8 +55,8 @@ SENSOR_FAULTS = {
     'delayed': FaultKind('gives its samples later', 'added latency', 's', 0.1, 0.0, 10.0),
     'intermittent': FaultKind('loses samples at random', 'probability', '', 0.5, 0.0, 1.0),
 }
-"""Faults of a link sensor."""
 
+# Faults of a flywheel drive.
 WHEEL_FAULTS = {
     'dead': FaultKind('the motor gives no torque'),
     'stuck': FaultKind('a brake holds the wheel to its link', 'torque', 'N m', 0.1, 0.0, 10.0),
@@ -67,7 +68,6 @@ WHEEL_FAULTS = {
                          'be cut', 'torque', 'N m', 10.0, -10.0, 10.0),
     'delayed': FaultKind('the motor follows its commands later', 'delay', 's', 0.05, 0.0, 1.0),
 }
-"""Faults of a flywheel drive."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,9 @@ class Fault:
     """
     One fault of one sensor or wheel.
 
-    :param target: what it hits: `link_a`, `joint_2`, `flywheel_c`.
+    :param target: its sensor or wheel: `link_a`, `joint_2`, `flywheel_c`.
     :param kind: one of SENSOR_FAULTS or WHEEL_FAULTS.
-    :param value: how much, in the unit of the kind; the default of the kind where none is given,
-        and None where it takes none.
+    :param value: in the unit of the kind, None for its default or for a fault without a value.
     :raises FaultError: unknown target or kind, or a value that this kind cannot have.
     """
 
@@ -87,13 +86,26 @@ class Fault:
     value: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot break like this, and fill in the value."""
+        """Check target and kind, and fill in the value."""
         kinds = fault_kinds(self.target)
         if self.kind not in tuple(kinds):
-            raise FaultError(f'unknown fault {self.kind!r} of {self.target} '
-                             f'(known are {", ".join(kinds)})')
-        value = _checked_value(f'{self.kind} of {self.target}', kinds[self.kind], self.value)
-        object.__setattr__(self, 'value', value)
+            raise FaultError(
+                f'unknown fault {self.kind!r} of {self.target} (known are {", ".join(kinds)})',
+                name=self.target, value=self.kind, limit=tuple(kinds))
+        object.__setattr__(self, 'value', self._checked_value(kinds[self.kind]))
+
+    def _checked_value(self, kind: FaultKind) -> float | None:
+        name = f'{self.target}.{self.kind}'
+        if kind.default is None:
+            if self.value is not None:
+                raise FaultError(f'{self.kind} of {self.target} takes no value, got '
+                                 f'{self.value!r}', name=name, value=self.value, limit=None)
+            return None
+        row = Setting(kind.quantity, kind.default, kind.unit, kind.meaning, kind.low, kind.high)
+        try:
+            return float(row.check(kind.default if self.value is None else self.value, name))
+        except SettingError as error:
+            raise FaultError(f'{kind.quantity} of {error}', **error.values) from None
 
     def __str__(self) -> str:
         """Write what `parse_fault` reads: `wrong 0.1`."""
@@ -102,7 +114,7 @@ class Fault:
 
 def fault_kinds(target: str) -> Mapping[str, FaultKind]:
     """
-    Return the ways in which a sensor or wheel can break, by name.
+    Return the kinds of fault of a sensor or wheel, by name.
 
     :raises FaultError: there is no such sensor or wheel.
     """
@@ -110,17 +122,18 @@ def fault_kinds(target: str) -> Mapping[str, FaultKind]:
         return SENSOR_FAULTS
     if target in FLYWHEEL_NAMES:
         return WHEEL_FAULTS
-    known = ', '.join((*SENSOR_NAMES, *FLYWHEEL_NAMES))
-    raise FaultError(f'nothing to break by the name of {target!r} (known are {known})')
+    known = (*SENSOR_NAMES, *FLYWHEEL_NAMES)
+    raise FaultError(f'no sensor or wheel {target!r} (known are {", ".join(known)})',
+                     name='target', value=target, limit=known)
 
 
 def parse_fault(target: str, text: str) -> Fault | None:
     """
-    Read a fault as people write it.
+    Read a fault from text.
 
-    :param target: what it hits.
-    :param text: `KIND` or `KIND VALUE`; empty or `none` where nothing is broken.
-    :returns: the fault, or None for none.
+    :param target: its sensor or wheel.
+    :param text: `KIND` or `KIND VALUE`; empty or `none` for no fault.
+    :returns: the fault, or None.
     :raises FaultError: unknown target or kind, or a value that this kind cannot have.
     """
     fault_kinds(target)
@@ -128,27 +141,28 @@ def parse_fault(target: str, text: str) -> Fault | None:
     if words in ([], ['none']):
         return None
     if len(words) > 2:
-        raise FaultError(f'fault of {target} must be KIND or KIND VALUE, got {text!r}')
+        raise FaultError(f'fault of {target} must be KIND or KIND VALUE, got {text!r}',
+                         name=target, value=text)
     if len(words) == 1:
         return Fault(target, words[0])
     try:
         value = float(words[1])
     except ValueError:
         raise FaultError(
-            f'value of the fault {words[0]!r} of {target} must be a number, got {words[1]!r}'
-        ) from None
+            f'value of the fault {words[0]!r} of {target} must be a number, got {words[1]!r}',
+            name=f'{target}.{words[0]}', value=words[1], limit=float) from None
     return Fault(target, words[0], value)
 
 
 @dataclass(frozen=True, eq=False)
 class WheelFaults:
     """
-    What the faults of the four wheels do to their drives; the arrays are read-only.
+    The effects of the faults of the four wheels on their drives; the arrays are read-only.
 
-    :param torque_scale: (4,) of the motor torque, 1 in health.
+    :param torque_scale: (4,) factor of the motor torque, 1 without a fault.
     :param extra_friction: (4,) Coulomb friction beyond that of the bearing [N m].
-    :param forced_torque: (4,) torque of a powered motor whatever the command is [N m], NaN in
-        health. It is not cut to what the motor can give.
+    :param forced_torque: (4,) torque of a powered motor whatever its command [N m], NaN without a
+        fault; not limited to the range of the motor.
     :param shorted_torque: (4,) likewise, powered or not.
     :param hold_torque: (4,) greatest torque of a brake between wheel and link [N m].
     :param command_delay_s: (4,) [s].
@@ -164,35 +178,20 @@ class WheelFaults:
 
 def wheel_faults(faults: Iterable[Fault]) -> WheelFaults:
     """
-    Turn faults into what they do to the drives of the wheels.
+    Return the effects of faults on the drives of the wheels.
 
-    :param faults: at most one for each target; those of sensors change nothing here.
+    :param faults: at most one for each target; those of sensors are ignored.
     """
-    made = WheelFaults(np.ones(4), np.zeros(4), np.full(4, nan), np.full(4, nan), np.zeros(4),
-                       np.zeros(4))
-    acts_on = {'dead': made.torque_scale, 'weak': made.torque_scale, 'stuck': made.hold_torque,
-               'dragging': made.extra_friction, 'runaway': made.forced_torque,
-               'shorted': made.shorted_torque, 'delayed': made.command_delay_s}
+    effects = WheelFaults(np.ones(4), np.zeros(4), np.full(4, nan), np.full(4, nan), np.zeros(4),
+                          np.zeros(4))
+    acts_on = {'dead': effects.torque_scale, 'weak': effects.torque_scale,
+               'stuck': effects.hold_torque, 'dragging': effects.extra_friction,
+               'runaway': effects.forced_torque, 'shorted': effects.shorted_torque,
+               'delayed': effects.command_delay_s}
     for fault in faults:
         if fault.target in FLYWHEEL_NAMES:
             wheel = FLYWHEEL_NAMES.index(fault.target)
             acts_on[fault.kind][wheel] = fault.value or 0.0
     for array in acts_on.values():
         array.flags.writeable = False
-    return made
-
-
-def _checked_value(what: str, kind: FaultKind, value: Any) -> float | None:
-    if kind.default is None:
-        if value is not None:
-            raise FaultError(f'{what} takes no value, got {value!r}')
-        return None
-    if value is None:
-        return kind.default
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise FaultError(f'{kind.quantity} of {what} must be a number, got {value!r}')
-    if not kind.low <= value <= kind.high:
-        unit = f' {kind.unit}' if kind.unit else ''
-        raise FaultError(f'{kind.quantity} of {what} must be from {kind.low:g} to '
-                         f'{kind.high:g}{unit}, got {value}')
-    return float(value)
+    return effects

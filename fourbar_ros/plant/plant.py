@@ -44,34 +44,34 @@ from fourbar_ros.plant.table import quantum, surroundings_of, Table
 import numpy as np
 from numpy.typing import ArrayLike
 
-# What dry friction in a joint makes of a rate must be slower than a step can follow (its real
-# limit for Runge-Kutta of order four is 2.8, here with a margin for other poses).
+# Largest decay rate by friction times the step. Runge-Kutta of order four is stable up to 2.8; the
+# margin is for other configurations.
 STIFFEST = 1.0
 
-# Torques that walk are at the first draw as if they had walked for so long [s]: what an estimator
-# believes of them that has seen nothing yet.
-WALKED_BEFORE = 10.0
+# Age of the random-walk torques at the first draw [s]. It sets their initial variance, which an
+# estimator assumes before the first measurement, too.
+RANDOM_WALK_AGE = 10.0
 
-# Relative rates in joints 1 to 4, from the rates of the links.
-RELATIVE = np.array([[-1, 1, 0, 0], [0, -1, 1, 0], [0, 0, -1, 1], [1, 0, 0, -1]], dtype=float)
+# The relative rates in joints 1 to 4 from the rates of the links.
+RELATIVE_RATES = np.array(
+    [[-1.0, 1.0, 0.0, 0.0], [0.0, -1.0, 1.0, 0.0], [0.0, 0.0, -1.0, 1.0], [1.0, 0.0, 0.0, -1.0]])
 
 
 class PlantError(FourbarError):
-    """A plant that cannot be simulated as asked, or whose state left the finite numbers."""
+    """A plant that cannot be simulated, or whose state left the finite numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
     """
-    What really is, sensors apart.
+    The true state, without the errors of the sensors.
 
     :param link_angles: (4,) continuous [rad].
     :param link_rates: (4,) [rad/s].
     :param wheel_angles: (4,) relative to the link, unwrapped [rad].
     :param wheel_speeds: (4,) relative to the link [rad/s].
     :param efforts: (4,) torque of each motor, mean over the last control period [N m].
-    :param walked_torques: (2,) the random torques on links a and b that walk, as they were in
-        that period [N m].
+    :param random_walk_torques: (2,) random-walk torques on links a and b in that period [N m].
     :param centre_position: (2,) of the mass centre of the whole, in frame `table` [m].
     :param centre_velocity: (2,) [m/s].
     :param base_position: (2,) of joint 1, the origin of the frame of link a [m].
@@ -83,7 +83,7 @@ class Truth:
     wheel_angles: Array
     wheel_speeds: Array
     efforts: Array
-    walked_torques: Array
+    random_walk_torques: Array
     centre_position: Array
     centre_velocity: Array
     base_position: Array
@@ -96,10 +96,10 @@ class Plant:
 
     :param mechanism: the linkage, its wheels and motor limits.
     :param table: the table and the sensors.
-    :param initial: where it starts.
+    :param initial: state at the start.
     :param step_s: integration step [s].
-    :param generator: source of all randomness.
-    :ivar link_sensors: with the samples on their way.
+    :param generator: source of all random numbers.
+    :ivar link_sensors: the sensors, with the samples on their way.
     :ivar motor_states: (4,) of `step.MOTOR_STATES`.
     :ivar efforts: (4,) mean torque of each motor since the last call of `advance` [N m].
     :raises PlantError: the step is not a positive number, or too long for the friction.
@@ -109,7 +109,8 @@ class Plant:
     def __init__(self, mechanism: Mechanism, table: Table, initial: InitialState, step_s: float,
                  generator: np.random.Generator) -> None:
         if not (isfinite(step_s) and step_s > 0.0):
-            raise PlantError(f'the plant step must be a positive number of seconds, got {step_s}')
+            raise PlantError(f'the plant step must be a positive number of seconds, got {step_s}',
+                             name='step', value=step_s)
         self.mechanism = mechanism
         self.step_s = step_s
         self._table = table
@@ -125,8 +126,8 @@ class Plant:
             restitution=surface.restitution)])
         self._parameters['around']['acting'] |= table.disturbance.acting
         self._constants = np.array([mechanism.constants])
-        self._walked = np.zeros(2)
-        self._walked_for: float | None = None
+        self._random_walk = np.zeros(2)
+        self._random_walk_for: float | None = None
         self.efforts = np.zeros(4)
         self.reset(initial)
         self._check_friction()
@@ -138,13 +139,15 @@ class Plant:
         joints = self._table.joints
         slope = joints.viscous + joints.coulomb * joints.static_ratio / joints.smoothing
         matrix = mass_matrix(self._state[LINK_ANGLES], self.mechanism.constants)
-        rates = np.linalg.eigvals(np.linalg.solve(matrix, slope * RELATIVE.T @ RELATIVE))
+        rates = np.linalg.eigvals(np.linalg.solve(
+            matrix, slope * RELATIVE_RATES.T @ RELATIVE_RATES))
         fastest = float(np.abs(rates).max())
         if fastest * self.step_s > STIFFEST:
             raise PlantError(
                 f'a step of {self.step_s:g} s is too long for the friction in the joints of this '
                 f'linkage, at most {STIFFEST / fastest:.2g} s: take a shorter step, less '
-                'joints.coulomb, or more joints.smoothing')
+                'joints.coulomb, or more joints.smoothing',
+                name='joints', value=self.step_s, limit=STIFFEST / fastest)
         links = self._table.links
         slowing = max(links.drag / self.mechanism.link_masses.min(),
                       links.spin_drag / self.mechanism.link_inertias.min())
@@ -152,13 +155,13 @@ class Plant:
             raise PlantError(
                 f'a step of {self.step_s:g} s is too long for the drag on these links, at most '
                 f'{STIFFEST / slowing:.2g} s: take a shorter step, less links.drag or '
-                'links.spin_drag')
+                'links.spin_drag', name='links', value=self.step_s, limit=STIFFEST / slowing)
 
     def reset(self, initial: InitialState) -> None:
         """
-        Put the linkage somewhere, at once, motors without torque; random numbers go on.
+        Set the state of the linkage, motors without torque; random numbers continue.
 
-        :raises PlantError, ClosureError: it cannot be there; then nothing was changed.
+        :raises PlantError, ClosureError: the linkage cannot be there; then nothing was changed.
         """
         state = _initial_state(self.mechanism, initial)
         self._check_place(state)
@@ -178,7 +181,8 @@ class Plant:
             if beyond.max() > 0.0:
                 raise PlantError(
                     f'joint {joint + 1} would start {beyond.max():.3g} m beyond the edge of the '
-                    'table: take a larger surface.size_x and size_y')
+                    'table: take a larger surface.size_x and size_y',
+                    joint=joint + 1, value=float(beyond.max()))
 
     def steps_in(self, duration_s: float) -> int:
         """
@@ -190,14 +194,15 @@ class Plant:
         if steps < 1 or abs(steps * self.step_s - duration_s) > 1e-9 * duration_s:
             raise PlantError(
                 f'the control period must be a whole multiple of the plant step: '
-                f'{duration_s:g} s / {self.step_s:g} s = {duration_s / self.step_s:g}')
+                f'{duration_s:g} s / {self.step_s:g} s = {duration_s / self.step_s:g}',
+                value=duration_s, limit=self.step_s)
         return steps
 
     def disturb(self, duration_s: float) -> None:
         """
-        Draw the random torques on the links anew.
+        Draw new random torques on the links.
 
-        :param duration_s: for how long they are going to be held [s].
+        :param duration_s: time for which they are going to be held [s].
         """
         disturbance = self._table.disturbance
         torques = np.zeros(4)
@@ -205,11 +210,12 @@ class Plant:
             torques = self._generator.standard_normal(4) * (
                 disturbance.torque_density / np.sqrt(duration_s))
         if disturbance.torque_walk:
-            elapsed = WALKED_BEFORE if self._walked_for is None else self._walked_for
-            self._walked = self._walked + self._generator.standard_normal(2) * (
+            elapsed = (RANDOM_WALK_AGE if self._random_walk_for is None
+                       else self._random_walk_for)
+            self._random_walk = self._random_walk + self._generator.standard_normal(2) * (
                 disturbance.torque_walk * np.sqrt(elapsed))
-            self._walked_for = duration_s
-            torques[:2] += self._walked
+            self._random_walk_for = duration_s
+            torques[:2] += self._random_walk
         if disturbance.acting:
             self.apply_link_torques(torques)
 
@@ -222,14 +228,14 @@ class Plant:
     def advance(self, steps: int, commands: Array, by_speed: ArrayLike = False,
                 powered: ArrayLike = True, conditions: Packed = SOUND) -> None:
         """
-        Move on by a number of steps.
+        Advance by a number of steps.
 
-        :param commands: (4,) torques asked of the motors [N m], or speeds of the wheels relative
-            to the links [rad/s]; or (steps, 4) of them, one for each step.
-        :param by_speed: which of both, (4,) or the same for all wheels.
-        :param powered: whose power stage is on, likewise. A motor without power is asked for no
-            torque, and its speed loop forgets.
-        :param conditions: what is wrong with the wheels.
+        :param commands: (4,) torques of the motors [N m], or speeds of the wheels relative to the
+            links [rad/s]; or (steps, 4), one row for each step.
+        :param by_speed: whether the command is a speed, (4,) or the same for all wheels.
+        :param powered: whether the power stage is on, likewise. A motor without power has a
+            commanded torque of zero, and its speed loop is reset.
+        :param conditions: effects of faults on the wheels.
         :raises PlantError: the state is no longer finite.
         """
         modes, held = np.empty(4, MODES), np.empty((steps, 4))
@@ -245,27 +251,27 @@ class Plant:
         """
         Return a copy of the true state.
 
-        :param efforts: (4,) to tell instead of those since the last call of `advance` [N m].
+        :param efforts: (4,) of the result, by default those of the last call of `advance` [N m].
         """
         state = self._state.copy()
         base = np.array(joint_motion(0, state, self._constants))
         return Truth(
             state[LINK_ANGLES], state[LINK_RATES], state[WHEEL_ANGLES],
             state[WHEEL_SPEEDS] - state[LINK_RATES],
-            self.efforts.copy() if efforts is None else efforts, self._walked.copy(),
+            self.efforts.copy() if efforts is None else efforts, self._random_walk.copy(),
             state[CENTRE_POSITION], state[CENTRE_VELOCITY], base[:2], base[2:])
 
     @property
     def contacts(self) -> int:
-        """How often a joint met the edge of the table since the start or the last reset."""
+        """Number of contacts with the edge of the table since the start or the last reset."""
         return int(self._sums['contacts'][0])
 
     def ledger(self) -> EnergyBudget:
-        """Draw up the accounts of energy and momentum since the start or the last reset."""
+        """Return the budget of energy and momentum since the start or the last reset."""
         return energy_budget(self.mechanism, self._state, self._start, self._sums)
 
     def measure_links(self, stamp_ns: int) -> None:
-        """Let the link sensors take a sample now, if one is due [ns]."""
+        """Sample the link sensors now [ns], if a sample is due."""
         self.link_sensors.measure(
             stamp_ns, self._state[LINK_ANGLES], self._state[LINK_RATES])
 
@@ -287,6 +293,6 @@ def _initial_state(mechanism: Mechanism, initial: InitialState) -> Array:
         if abs(np.sin(angles[3] - angles[2])) < RATES_UNDETERMINED:
             raise PlantError(
                 f'initial rates are given at a change point ({LINK_NAMES[2]} and {LINK_NAMES[3]} '
-                'on a line), where they do not determine the motion')
+                'on a line), where they do not determine the motion', limit=RATES_UNDETERMINED)
         rates[2:] = gamma_matrix(angles, mechanism.constants.lengths) @ rates[:2]
     return make_state(angles, rates)

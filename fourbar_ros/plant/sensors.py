@@ -2,24 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The sensors of the links: what they make of the truth, and when they say it.
+The sensors of the links: errors, resolution and latency of their samples.
 
-Of kind `absolute` there is one for each link, the orientation of the link in frame `table`. Of
-kind `joint` there is an encoder at each joint, the second link relative to the first, and one
+Sensors of kind `absolute` measure the orientation of each link in frame `table`. Those of kind
+`joint` are an encoder at each joint, which measures the second link relative to the first, and an
 absolute sensor on one link, the heading: relative encoders alone cannot observe attitude.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import groupby
 from math import exp, pi, remainder, sqrt
 from operator import itemgetter
-from typing import Any
 
 from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.settings import setting, SettingError, Settings, settings_of
 from fourbar_ros.mechanism import JOINT_LINKS, JOINT_NAMES, LINK_NAMES
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plant.faults import Fault
@@ -28,11 +28,11 @@ import numpy as np
 KINDS = ('absolute', 'joint')
 
 TURN = 2.0 * pi
-# Random numbers of one sample, always drawn and always all of them, so that no setting and no
-# fault shifts those of later samples: normal for noise, random walk, latency, gyro noise and gyro
-# walk; uniform for dropout, the intermittent and the garbage fault.
+# Random numbers of one sample: normal for noise, random walk, latency, gyro noise and gyro walk;
+# uniform for dropout, the intermittent and the garbage fault. All of them are always drawn, so
+# that no setting and no fault shifts those of later samples.
 NORMALS, UNIFORMS = 5, 3
-# Samples for which random numbers are drawn at once: numpy is slow by the single number.
+# Samples for which random numbers are drawn at once: numpy is slow for a single number.
 BLOCK = 64
 
 _Draws = tuple[float, float, float, float, float, float, float, float]
@@ -40,121 +40,86 @@ _Pending = tuple[int, int, int, float, float]
 
 
 class SensorError(FourbarError):
-    """A sensor that cannot exist, or that is asked at a time that cannot be."""
-
-
-# What a key of the settings may be: from, to, unit.
-_RANGES = {
-    'noise_rms': (0.0, 10.0, 'rad'),
-    'bias': (-10.0, 10.0, 'rad'),
-    'random_walk': (0.0, 10.0, 'rad/sqrt(s)'),
-    'counts_per_turn': (0, 2 ** 31, ''),
-    'scale_error': (-0.5, 0.5, ''),
-    'latency': (0.0, 10.0, 's'),
-    'jitter': (0.0, 10.0, 's'),
-    'dropout': (0.0, 1.0, ''),
-    'rate': (0.0, 1e5, 'Hz'),
-    'gyro_noise_rms': (0.0, 1000.0, 'rad/s'),
-    'gyro_bias': (-1000.0, 1000.0, 'rad/s'),
-    'gyro_random_walk': (0.0, 1000.0, 'rad/s/sqrt(s)'),
-}
+    """A sample at a time that cannot follow the one before."""
 
 
 @dataclass(frozen=True)
-class LinkSensorSettings:
+class LinkSensorSettings(Settings):
     """
-    What the sensors of the links are like; the defaults are perfect ones.
+    The settings of the sensors of the links; the defaults describe perfect sensors.
 
-    :param kind: `absolute` or `joint`.
-    :param noise_rms: white noise of each sample [rad].
-    :param bias: constant error [rad]: one number for all, or one for each sensor, in the order of
-        `sensor_names`.
-    :param random_walk: drift, grows with the square root of time [rad/sqrt(s)].
-    :param counts_per_turn: resolution, 0 for none.
-    :param scale_error: relative error of the continuous angle since the sensor's zero.
-    :param latency: from measurement to arrival, at least [s].
-    :param jitter: rms of the additional latency, a half-normal distribution [s].
-    :param dropout: probability that a sample is lost.
-    :param rate: samples per second [Hz], 0 for one whenever they are asked.
-    :param heading: link with the absolute sensor where the others are at the joints.
-    :param gyro: whether the sensors measure rates as well.
-    :param gyro_noise_rms: white noise of each sample [rad/s].
-    :param gyro_bias: constant error [rad/s], as `bias`.
-    :param gyro_random_walk: drift [rad/s/sqrt(s)].
-    :raises SensorError: a value that no sensor can have, by its name.
+    `bias` and `gyro_bias` are one number for all sensors, or one for each sensor in the order of
+    `sensor_names`.
+
+    :raises SettingError: a value is refused.
     """
 
-    kind: str = 'absolute'
-    noise_rms: float = 0.0
-    bias: float | tuple[float, ...] = 0.0
-    random_walk: float = 0.0
-    counts_per_turn: int = 0
-    scale_error: float = 0.0
-    latency: float = 0.0
-    jitter: float = 0.0
-    dropout: float = 0.0
-    rate: float = 0.0
-    heading: str | None = 'link_a'
-    gyro: bool = False
-    gyro_noise_rms: float = 0.0
-    gyro_bias: float | tuple[float, ...] = 0.0
-    gyro_random_walk: float = 0.0
+    section = 'link_sensors'
+
+    kind: str = setting('absolute', '', 'where the sensors are', choices=KINDS)
+    noise_rms: float = setting(0.0, 'rad', 'white noise of each sample', low=0.0, high=10.0)
+    bias: float | tuple[float, ...] = setting(
+        0.0, 'rad', 'constant error', low=-10.0, high=10.0)
+    random_walk: float = setting(
+        0.0, 'rad/sqrt(s)', 'drift, which grows with the square root of time', low=0.0, high=10.0)
+    counts_per_turn: int = setting(
+        0, 'counts per turn', 'resolution, 0 for unlimited', low=0, high=2**31)
+    scale_error: float = setting(
+        0.0, '', 'relative error of the continuous angle since the zero of the sensor',
+        low=-0.5, high=0.5)
+    latency: float = setting(
+        0.0, 's', 'shortest time from measurement to arrival', low=0.0, high=10.0)
+    jitter: float = setting(
+        0.0, 's', 'rms of the additional latency, of a half-normal distribution', low=0.0,
+        high=10.0)
+    dropout: float = setting(0.0, '', 'probability that a sample is lost', low=0.0, high=1.0)
+    rate: float = setting(
+        0.0, 'Hz', 'sampling rate, 0 for a sample at every tick', low=0.0, high=1e5)
+    heading: str | None = setting(
+        'link_a', '', 'link with the absolute sensor where the others are joint encoders',
+        choices=('', *LINK_NAMES))
+    gyro: bool = setting(False, '', 'whether the sensors measure rates, too')
+    gyro_noise_rms: float = setting(
+        0.0, 'rad/s', 'white noise of each sample', low=0.0, high=1000.0)
+    gyro_bias: float | tuple[float, ...] = setting(
+        0.0, 'rad/s', 'constant error', low=-1000.0, high=1000.0)
+    gyro_random_walk: float = setting(
+        0.0, 'rad/s/sqrt(s)', 'drift', low=0.0, high=1000.0)
 
     def __post_init__(self) -> None:
-        """Refuse what no sensor can have."""
-        if self.kind not in KINDS:
-            raise SensorError(
-                f'link_sensors.kind must be one of {", ".join(KINDS)}, got {self.kind!r}')
-        self._check_heading()
-        if not isinstance(self.gyro, bool):
-            raise SensorError(f'link_sensors.gyro must be true or false, got {self.gyro!r}')
-        for item in fields(self):
-            if item.name in ('bias', 'gyro_bias'):
-                self._check_each(item.name)
-            elif item.name in _RANGES:
-                _check(item.name, getattr(self, item.name))
-        if self.counts_per_turn != int(self.counts_per_turn):
-            raise SensorError('link_sensors.counts_per_turn must be a whole number, got '
-                              f'{self.counts_per_turn}')
+        """Check every value."""
+        rows = {row.name: row for row in settings_of(type(self))}
+        lists = {name: value for name in ('bias', 'gyro_bias')
+                 if isinstance(value := getattr(self, name), (list, tuple))}
+        for name in lists:
+            object.__setattr__(self, name, 0.0)
+        if self.heading is None:
+            object.__setattr__(self, 'heading', '')
+        super().__post_init__()
+        if self.kind == 'joint' and not self.heading:
+            raise SettingError(
+                'link_sensors.heading must name a link with an absolute sensor '
+                f'({", ".join(LINK_NAMES)}): relative encoders alone cannot observe attitude',
+                name='link_sensors.heading', value=self.heading, limit=LINK_NAMES)
+        for name, value in lists.items():
+            object.__setattr__(self, name, tuple(rows[name].check_each(
+                value, self.sensor_names, f'link_sensors.{name}')))
 
     @property
     def sensor_names(self) -> tuple[str, ...]:
-        """Names of the sensors: four links, or four joints and the heading's link."""
+        """Names of the sensors: four links, or four joints and the link of the heading."""
         if self.kind == 'absolute':
             return LINK_NAMES
         return (*JOINT_NAMES, str(self.heading))
-
-    def _check_heading(self) -> None:
-        if self.kind == 'joint' and self.heading in (None, ''):
-            raise SensorError(
-                'link_sensors.heading must name a link with an absolute sensor '
-                f'({", ".join(LINK_NAMES)}): relative encoders alone cannot observe attitude, '
-                'they read the same however the whole linkage is turned on the table')
-        if self.heading not in (None, '', *LINK_NAMES):
-            raise SensorError(f'link_sensors.heading must be one of {", ".join(LINK_NAMES)}, got '
-                              f'{self.heading!r}')
-
-    def _check_each(self, name: str) -> None:
-        given = getattr(self, name)
-        if not isinstance(given, (list, tuple)):
-            _check(name, given)
-            return
-        if len(given) != len(self.sensor_names):
-            raise SensorError(
-                f'link_sensors.{name} must be one number or {len(self.sensor_names)} '
-                f'({", ".join(self.sensor_names)}), got {len(given)}')
-        for index, value in enumerate(given):
-            _check(name, value, f'[{index}]')
-        object.__setattr__(self, name, tuple(given))
 
 
 @dataclass(frozen=True, eq=False)
 class SensorReading:
     """
-    What arrived of the samples of one instant.
+    The samples of one instant that arrived together.
 
     :param stamp_ns: time of measurement [ns].
-    :param names: the sensors that gave a sample, in the order of the settings' `sensor_names`.
+    :param names: the sensors with a sample, in the order of the settings' `sensor_names`.
     :param angles: (n,) orientation of each in frame `table`, or of the joint's second link
         relative to its first, in (-pi, pi] [rad].
     :param rates: (n,) their rates [rad/s], or (0,) where no gyros are fitted.
@@ -170,10 +135,10 @@ class LinkSensors:
     """
     The sensors of the links, with samples on their way.
 
-    Every sensor has random numbers of its own, and uses as many for each sample whatever its
-    settings and faults: what befalls one leaves the others as they are, bit for bit.
+    Every sensor has random numbers of its own and uses the same number of them for each sample:
+    the settings and faults of one sensor leave the samples of the others unchanged, bit for bit.
 
-    :param settings: what they are like.
+    :param settings: of all sensors.
     :param seeds: parent of the seeds of each.
     """
 
@@ -192,21 +157,21 @@ class LinkSensors:
 
     @property
     def next_sample_ns(self) -> int | None:
-        """Time from which on the next sample is taken [ns], None for at once."""
+        """Earliest time of the next sample [ns], None for any time."""
         return self._next_ns
 
     def set_faults(self, faults: Mapping[str, Fault]) -> None:
         """
-        Break the sensors that are named, from the next sample on, and mend all others.
+        Set the faults of all sensors, from the next sample on.
 
-        :param faults: by what they hit; names of other things change nothing here.
+        :param faults: by the name of the target; those of other targets are ignored.
         """
         for name, sensor in zip(self.names, self._sensors):
             sensor.fault = faults.get(name)
 
     def reset(self) -> None:
         """
-        Forget the samples on their way, because the linkage was put somewhere else.
+        Discard the samples on their way after a jump of the linkage.
 
         Random numbers and drifts go on. The next sample may have any stamp.
         """
@@ -215,15 +180,16 @@ class LinkSensors:
 
     def measure(self, stamp_ns: int, link_angles: Array, link_rates: Array) -> None:
         """
-        Let every sensor take a sample, at most one each, if one is due by their rate.
+        Take a sample of every sensor if one is due by the sampling rate.
 
-        :param stamp_ns: now, later than the time before [ns].
+        :param stamp_ns: now, later than in the call before [ns].
         :param link_angles: (4,) true orientations, continuous [rad].
         :param link_rates: (4,) their rates [rad/s].
-        :raises SensorError: time does not go on.
+        :raises SensorError: the time does not increase.
         """
         if self._last_ns is not None and stamp_ns <= self._last_ns:
-            raise SensorError(f'a sample at {stamp_ns} ns cannot follow one at {self._last_ns} ns')
+            raise SensorError(f'a sample at {stamp_ns} ns cannot follow one at {self._last_ns} ns',
+                              value=stamp_ns, limit=self._last_ns)
         if self._next_ns is not None and stamp_ns < self._next_ns:
             return
         elapsed_s = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) * 1e-9
@@ -240,10 +206,10 @@ class LinkSensors:
 
     def due(self, tick_ns: int) -> tuple[SensorReading, ...]:
         """
-        Hand out the samples that have arrived by a tick, each once.
+        Return the samples that have arrived by a tick, each once.
 
         :param tick_ns: now [ns].
-        :returns: one reading for each time of measurement, in the order of these.
+        :returns: one reading for each time of measurement, in order.
         """
         queue = self._queue
         arrived = []
@@ -385,12 +351,3 @@ def _in_one_turn(angle: float, counts: int) -> float:
 
 def _of_sensor(value: float | tuple[float, ...], index: int) -> float:
     return float(value[index] if isinstance(value, tuple) else value)
-
-
-def _check(name: str, value: Any, place: str = '') -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise SensorError(f'link_sensors.{name}{place} must be a number, got {value!r}')
-    low, high, unit = _RANGES[name]
-    if not low <= value <= high:
-        raise SensorError(f'link_sensors.{name}{place} must be from {low:g} to {high:g}'
-                          f'{" " if unit else ""}{unit}, got {value}')

@@ -48,9 +48,10 @@ CONDITIONS: Fields = [
     ('shorted', float, (4,)),           # N m, powered or not; NaN for none
     ('extra_coulomb', float, (4,)),     # N m
 ]
+# The effects of faults on the wheels, a scalar of `CONDITIONS`.
 WheelConditions = np.record
-"""The effects of faults on the wheels, a scalar of `CONDITIONS`."""
 
+# The parameters of the plant, for its kernel.
 PARAMETERS: Fields = [
     ('constants', np.dtype((np.record, CONSTANTS)), ()),
     ('around', np.dtype((np.record, SURROUNDINGS)), ()),
@@ -59,20 +60,19 @@ PARAMETERS: Fields = [
     ('half_sizes', float, (2,)),        # m, from the middle of the table to its edges
     ('restitution', float, ()),         # of the edge
 ]
-"""The parameters of the plant, for its kernel."""
 
+# How a wheel is driven: by a commanded speed or torque, with or without power.
 MODES = np.dtype([('by_speed', bool), ('powered', bool)])
-"""How a wheel is driven: by a commanded speed or torque, with or without power."""
 
+# State of a motor: its torque [N m], and the integral of its speed loop [N m], NaN at rest.
 MOTOR_STATES = np.dtype([('torque', float), ('integral', float)])
-"""State of a motor: its torque [N m], and the integral of its speed loop [N m], NaN at rest."""
 
+# An array of one record: numba takes longer to receive a record by itself than to use it.
 Packed = NDArray[Any]
-"""An array of one record: numba takes longer to receive a record by itself than to use it."""
 
+# The conditions of wheels without a fault.
 SOUND: Packed = np.array([record(
     CONDITIONS, scale=1.0, forced=nan, shorted=nan, extra_coulomb=0.0)])
-"""The conditions of wheels without a fault."""
 
 
 def conditions_of(faults: WheelFaults) -> Packed:

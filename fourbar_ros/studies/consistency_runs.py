@@ -48,7 +48,7 @@ def execute(scenario: Scenario) -> RunSums:
     angles = np.array([truth.link_angles for truth in truths if truth is not None])
     rates = np.array([truth.link_rates for truth in truths if truth is not None])
     speeds = np.array([truth.wheel_speeds for truth in truths if truth is not None])
-    walked = np.array([truth.walked_torques for truth in truths if truth is not None])
+    walked = np.array([truth.random_walk_torques for truth in truths if truth is not None])
 
     errors, link_errors = np.full((len(steps), 6), np.nan), np.full((len(steps), 8), np.nan)
     covariances = np.full((len(steps), FREE, FREE), np.nan)

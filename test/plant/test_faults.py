@@ -3,6 +3,8 @@
 
 """What can break, how people write it, and what broken wheel drives become."""
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import FrozenInstanceError
 from math import inf, nan, pi
 
@@ -11,6 +13,7 @@ from fourbar_ros.plant.faults import (
     Fault,
     fault_kinds,
     FaultError,
+    FaultKind,
     parse_fault,
     SENSOR_FAULTS,
     WHEEL_FAULTS,
@@ -22,6 +25,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+Refuses = Callable[..., AbstractContextManager[None]]
 HEALTHY_WHEELS = wheel_faults(())
 TARGETS = (*SENSOR_NAMES, *FLYWHEEL_NAMES)
 ALL = [(target, kind) for target in TARGETS for kind in fault_kinds(target)]
@@ -80,53 +84,57 @@ def test_ends_of_the_range_are_taken(target: str, kind: str) -> None:
 
 
 @pytest.mark.parametrize(('target', 'kind'), WITH_VALUE)
-def test_beyond_the_range_is_refused_with_the_range(target: str, kind: str) -> None:
+def test_value_beyond_the_range_is_refused(target: str, kind: str, refuses: Refuses) -> None:
     what = fault_kinds(target)[kind]
-    limits = f'{what.quantity} of {kind} of {target} must be from {what.low:g} to {what.high:g}'
     for value in (np.nextafter(what.low, -inf), np.nextafter(what.high, inf), nan, inf, -inf):
-        with pytest.raises(FaultError, match=limits):
+        with refuses(FaultError, name=f'{target}.{kind}', limit=(what.low, what.high)):
             Fault(target, kind, float(value))
 
 
 @pytest.mark.parametrize('value', ['1', True, [0.1], {}])
-def test_value_that_is_no_number_is_refused(value: object) -> None:
-    with pytest.raises(FaultError, match='of wrong of link_a must be a number'):
+def test_value_that_is_no_number_is_refused(value: object, refuses: Refuses) -> None:
+    with refuses(FaultError, name='link_a.wrong', value=value, limit=float):
         Fault('link_a', 'wrong', value)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(('target', 'kind'), WITHOUT_VALUE)
-def test_value_that_means_nothing_is_refused(target: str, kind: str) -> None:
-    with pytest.raises(FaultError, match=f'{kind} of {target} takes no value, got 0.5'):
+def test_value_of_a_fault_without_one_is_refused(
+    target: str, kind: str, refuses: Refuses,
+) -> None:
+    with refuses(FaultError, name=f'{target}.{kind}', value=0.5, limit=None):
         parse_fault(target, f'{kind} 0.5')
 
 
 @pytest.mark.parametrize('probability', ['-0.1', '1.1', 'nan'])
-def test_probability_outside_0_to_1_is_refused_by_name(probability: str) -> None:
-    with pytest.raises(FaultError, match='probability of intermittent of joint_2 .* 0 to 1, got'):
+def test_probability_outside_0_to_1_is_refused(probability: str, refuses: Refuses) -> None:
+    with refuses(FaultError, name='joint_2.intermittent', limit=(0.0, 1.0)):
         parse_fault('joint_2', f'intermittent {probability}')
 
 
-def test_unknown_kind_is_refused_with_those_known() -> None:
-    with pytest.raises(FaultError, match="unknown fault 'dead' of link_b .*off, stuck, garbage"):
-        parse_fault('link_b', 'dead')
-    with pytest.raises(FaultError, match="unknown fault 'off' of flywheel_b .*dead, stuck, weak"):
-        parse_fault('flywheel_b', 'off')
+@pytest.mark.parametrize(('target', 'kind', 'known'), [
+    ('link_b', 'dead', SENSOR_FAULTS), ('flywheel_b', 'off', WHEEL_FAULTS)])
+def test_unknown_kind_is_refused_with_those_known(
+    target: str, kind: str, known: dict[str, FaultKind], refuses: Refuses,
+) -> None:
+    with refuses(FaultError, name=target, value=kind, limit=tuple(known)):
+        parse_fault(target, kind)
 
 
 @pytest.mark.parametrize('text', ['', 'none', 'stuck'])
-def test_unknown_target_is_refused_with_those_known(text: str) -> None:
-    with pytest.raises(FaultError, match="'link_e' .*link_a, .*joint_4, .*flywheel_d"):
+def test_unknown_target_is_refused_with_those_known(text: str, refuses: Refuses) -> None:
+    known = (*SENSOR_NAMES, *FLYWHEEL_NAMES)
+    with refuses(FaultError, name='target', value='link_e', limit=known):
         parse_fault('link_e', text)
 
 
 @pytest.mark.parametrize('text', ['wrong 0.1 rad', 'none none none'])
-def test_too_many_words_are_refused(text: str) -> None:
-    with pytest.raises(FaultError, match=f"link_a must be KIND or KIND VALUE, got '{text}'"):
+def test_too_many_words_are_refused(text: str, refuses: Refuses) -> None:
+    with refuses(FaultError, name='link_a', value=text):
         parse_fault('link_a', text)
 
 
-def test_value_that_is_a_word_is_refused() -> None:
-    with pytest.raises(FaultError, match="'wrong' of link_a must be a number, got '0.1rad'"):
+def test_value_that_is_a_word_is_refused(refuses: Refuses) -> None:
+    with refuses(FaultError, name='link_a.wrong', value='0.1rad', limit=float):
         parse_fault('link_a', 'wrong 0.1rad')
 
 
@@ -175,5 +183,5 @@ def test_every_wheel_has_its_own_fault() -> None:
 
 @pytest.mark.parametrize('name', ARRAYS)
 def test_wheel_numbers_cannot_be_written_to(name: str) -> None:
-    with pytest.raises(ValueError, match='read-only'):
+    with pytest.raises(ValueError):
         getattr(wheel_faults([Fault('flywheel_a', 'dead')]), name)[0] = 1.0

@@ -4,6 +4,7 @@
 """The accounts of energy and momentum, and the edge of the table."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 
 from fourbar_ros.mechanism import load_mechanism, Mechanism
@@ -11,7 +12,7 @@ from fourbar_ros.mechanism.momentum import joint_gaps, linear_momentum, total_an
 from fourbar_ros.mechanism.state import LINK_RATES
 from fourbar_ros.plant import InitialState, load_table, Plant, PlantError, Table
 from fourbar_ros.plant.edge import joint_levers
-from fourbar_ros.plant.plant import WALKED_BEFORE
+from fourbar_ros.plant.plant import RANDOM_WALK_AGE
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import (
     Disturbance,
@@ -27,6 +28,7 @@ import pytest
 
 Array = NDArray[np.float64]
 MakePlant = Callable[..., Plant]
+Refuses = Callable[..., AbstractContextManager[None]]
 
 MOVING = InitialState(0.3, 1.6, 'open', 1.0, -0.5)
 SENSORS = {'link_sensors': LinkSensorSettings(), 'wheel_encoders': WheelEncoders(0)}
@@ -156,7 +158,7 @@ def test_disturbances_walk_with_the_density_asked_for(
     for _ in range(draws):
         plant.disturb(period)
         plant.advance(8, np.zeros(4))
-        torques.append(plant.truth().walked_torques)
+        torques.append(plant.truth().random_walk_torques)
         spin.append(plant.ledger().disturbance_spin)
     np.testing.assert_allclose(spin, period * np.cumsum(np.sum(torques, axis=1)), rtol=1e-9)
     steps = np.diff(torques, axis=0) / (density * np.sqrt(period))
@@ -167,7 +169,7 @@ def test_disturbances_walk_with_the_density_asked_for(
     for seed in range(200):
         plant = make_plant(prototype, table=table, seed=seed)
         plant.disturb(period)
-        begins.append(plant.truth().walked_torques / (density * np.sqrt(WALKED_BEFORE)))
+        begins.append(plant.truth().random_walk_torques / (density * np.sqrt(RANDOM_WALK_AGE)))
     assert abs(np.square(begins).mean() - 1.0) < 4.0 * np.sqrt(2.0 / 400)
 
 
@@ -180,12 +182,12 @@ def test_walk_is_drawn_after_the_white_torques_and_goes_on_over_a_reset(
     for plant in (white, both):
         plant.disturb(4e-3)
         plant.advance(8, np.zeros(4))
-    assert white.truth().walked_torques.tolist() == [0.0, 0.0]
-    walked = both.truth().walked_torques
+    assert white.truth().random_walk_torques.tolist() == [0.0, 0.0]
+    walked = both.truth().random_walk_torques
     assert both.ledger().disturbance_spin - white.ledger().disturbance_spin == pytest.approx(
         4e-3 * walked.sum(), rel=1e-9)
     both.reset(MOVING)
-    assert both.truth().walked_torques.tolist() == walked.tolist()
+    assert both.truth().random_walk_torques.tolist() == walked.tolist()
 
 
 @pytest.mark.parametrize('restitution', [0.0, 0.5, 1.0])
@@ -246,36 +248,36 @@ def test_reset_opens_new_accounts(prototype: Mechanism, make_plant: MakePlant) -
     ledger = plant.ledger()
     assert (ledger.supplied, ledger.bearings, ledger.unaccounted, ledger.contacts) == (0, 0, 0, 0)
     assert plant.truth().link_rates[:2].tolist() == [1.0, -0.5]
-    with pytest.raises(PlantError, match='finite'):
-        plant.reset(replace(MOVING, rate_a=np.nan))
+    with pytest.raises(PlantError):
+        plant.reset(InitialState(0.0, 0.0, rate_a=1.0))     # a change point
     assert plant.truth().link_rates[:2].tolist() == [1.0, -0.5]
 
 
 def test_friction_too_stiff_for_the_step_is_refused(
-    paper: Mechanism, make_plant: MakePlant,
+    paper: Mechanism, make_plant: MakePlant, refuses: Refuses,
 ) -> None:
     """The links of the paper are too light for the joints of the prototype."""
-    with pytest.raises(PlantError, match=r'too long for the friction .* at most 4') as caught:
+    with refuses(PlantError, name='joints', value=5e-4, limit=pytest.approx(4.5e-6, rel=0.12)):
         make_plant(paper, table=load_table('prototype'))
-    assert 'joints.smoothing' in str(caught.value)
 
 
-@pytest.mark.parametrize(('drag', 'word'), [
-    (Links(1e4, 0.0), 'links.drag'), (Links(0.0, 1e3), 'links.spin_drag')])
+@pytest.mark.parametrize('drag', [Links(1e4, 0.0), Links(0.0, 1e3)])
 def test_drag_too_stiff_for_the_step_is_refused(
-    drag: Links, word: str, prototype: Mechanism, make_plant: MakePlant,
+    drag: Links, prototype: Mechanism, make_plant: MakePlant, refuses: Refuses,
 ) -> None:
-    with pytest.raises(PlantError, match=rf'too long for the drag .*{word}'):
+    with refuses(PlantError, name='links', value=5e-4):
         make_plant(prototype, table=Table(**SENSORS, links=drag))
 
 
 def test_start_beyond_the_edge_is_refused(prototype: Mechanism, make_plant: MakePlant) -> None:
     """By the joint, and how far; a reset to there changes nothing."""
     small = Table(**SENSORS, surface=Surface(size_x=0.55))
-    with pytest.raises(PlantError, match=r'joint [1-4] would start 0\.\d+ m beyond the edge'):
+    with pytest.raises(PlantError) as refusal:
         make_plant(prototype, table=small, initial=InitialState(0.0, 0.3))
+    values = refusal.value.values
+    assert values['joint'] in range(1, 5) and 0.0 < values['value'] < 1.0
     plant = make_plant(prototype, table=small, initial=InitialState(0.0, np.pi / 2))
-    with pytest.raises(PlantError, match='beyond the edge'):
+    with pytest.raises(PlantError):
         plant.reset(InitialState(0.0, 0.3))
     assert plant.truth().link_angles[1] == pytest.approx(np.pi / 2)
 

@@ -16,6 +16,7 @@ from fourbar_ros.mechanism import (
     kinetic_energy,
     Mechanism,
 )
+from fourbar_ros.mechanism.change_points import RATES_UNDETERMINED
 from fourbar_ros.mechanism.closure import BRANCHES
 from fourbar_ros.plant import InitialState, Plant, PlantError, Table, Truth
 from fourbar_ros.plant.sensors import LinkSensorSettings
@@ -28,6 +29,7 @@ import pytest
 
 Array = NDArray[np.float64]
 MakePlant = Callable[..., Plant]
+Refuses = Callable[..., AbstractContextManager[None]]
 
 STEP = 5e-4
 # 4000 steps (2 s), some ten roundings of 1.1e-16 each, all to the same side: 4.4e-12. The
@@ -237,24 +239,26 @@ def test_whole_multiples_are_counted(count: int, step: float, make_plant: MakePl
     assert plant.steps_in(count * step) == count
 
 
-@pytest.mark.parametrize(('period', 'ratio'), [(0.0041, '8.2'), (1e-4, '0.2'), (1e-9, '2e-06')])
+@pytest.mark.parametrize('period', [0.0041, 1e-4, 1e-9])
 def test_period_that_is_no_multiple_is_refused(
-    period: float, ratio: str, make_plant: MakePlant,
+    period: float, make_plant: MakePlant, refuses: Refuses,
 ) -> None:
-    with pytest.raises(PlantError, match=f'whole multiple.* = {ratio}'):
+    with refuses(PlantError, value=period, limit=5e-4):
         make_plant().steps_in(period)
 
 
 @pytest.mark.parametrize('step', [0.0, -1e-3, nan, inf])
-def test_step_that_is_no_positive_number_is_refused(step: float, make_plant: MakePlant) -> None:
-    with pytest.raises(PlantError, match=f'positive number of seconds, got {step}'):
+def test_step_that_is_no_positive_number_is_refused(
+    step: float, make_plant: MakePlant, refuses: Refuses,
+) -> None:
+    with refuses(PlantError, name='step', value=pytest.approx(step, nan_ok=True)):
         make_plant(step_s=step)
 
 
 @pytest.mark.parametrize('name', ['link_a', 'link_b', 'rate_a', 'rate_b'])
 @pytest.mark.parametrize('value', [nan, inf, -inf])
 def test_initial_state_must_be_finite(
-    name: str, value: float, refuses: Callable[..., AbstractContextManager[None]],
+    name: str, value: float, refuses: Refuses,
 ) -> None:
     with refuses(SettingError, name=f'initial.{name}', value=value):
         replace(InitialState(), **{name: value})
@@ -262,12 +266,12 @@ def test_initial_state_must_be_finite(
 
 @pytest.mark.parametrize('theta', [0.0, pi])
 def test_rates_at_a_change_point_are_refused(
-    theta: float, paper: Mechanism, make_plant: MakePlant,
+    theta: float, paper: Mechanism, make_plant: MakePlant, refuses: Refuses,
 ) -> None:
     """At rest it is a place to start from; moving, two rates do not determine the other two."""
     rectangle = replace(paper, link_lengths=np.array([0.1, 0.05, 0.1, 0.05]))
     make_plant(rectangle, initial=InitialState(0.2, 0.2 + theta))
-    with pytest.raises(PlantError, match='change point'):
+    with refuses(PlantError, limit=RATES_UNDETERMINED):
         make_plant(rectangle, initial=InitialState(0.2, 0.2 + theta, rate_b=0.1))
 
 
@@ -275,12 +279,12 @@ def test_initial_angles_that_cannot_close_are_refused(
     uneven: Mechanism, make_plant: MakePlant,
 ) -> None:
     long = replace(uneven, link_lengths=np.array([0.3, 0.3, 0.2, 0.2]))
-    with pytest.raises(ClosureError, match='link_b = 3'):
+    with pytest.raises(ClosureError):
         make_plant(long, initial=InitialState(0.0, 3.0))
 
 
 def test_initial_branch_is_one_that_can_be_assembled(
-    refuses: Callable[..., AbstractContextManager[None]],
+    refuses: Refuses,
 ) -> None:
     with refuses(SettingError, name='initial.branch', value='folded', limit=BRANCHES):
         InitialState(branch='folded')
@@ -290,5 +294,5 @@ def test_state_out_of_the_finite_numbers_is_an_error(
     paper: Mechanism, make_plant: MakePlant,
 ) -> None:
     plant = make_plant(replace(paper, motor_torque_limits=np.full(4, inf)))
-    with pytest.raises(PlantError, match='no longer finite'):
+    with pytest.raises(PlantError):
         plant.advance(10, np.full(4, 1e300))

@@ -4,7 +4,8 @@
 """Faults come and go at their time, and a schedule that cannot be followed is refused."""
 
 from collections.abc import Callable
-from math import inf, nan
+from contextlib import AbstractContextManager
+from math import inf, nan, pi
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES
 from fourbar_ros.plant.fault_schedule import (
     FaultBoard,
     FaultChange,
+    LATEST_S,
     parse_schedule,
     ScheduledFault,
 )
-from fourbar_ros.plant.faults import Fault, FaultError
+from fourbar_ros.plant.faults import Fault, FaultError, SENSOR_FAULTS
 import pytest
 
+Refuses = Callable[..., AbstractContextManager[None]]
 TARGETS = (*LINK_NAMES, *FLYWHEEL_NAMES)
 S = 1_000_000_000
 WRONG = {'at': 2.0, 'until': 5.0, 'target': 'link_b', 'fault': 'wrong', 'value': 0.1}
@@ -144,69 +147,72 @@ def test_faults_can_be_seen_but_not_written(board: FaultBoard) -> None:
         board.faults['link_a'] = Fault('link_a', 'off')  # type: ignore[index]
 
 
-@pytest.mark.parametrize(('changed', 'message'), [
-    ({'target': 'link_e'}, "'link_e'.*known are link_a"),
-    ({'target': 'joint_1'}, 'no joint_1 here .*there are link_a, '),
-    ({'target': ['link_a']}, 'nothing to break'),
-    ({'fault': 'broken'}, "unknown fault 'broken' of link_b .*known are off, stuck"),
-    ({'fault': 'wrong 0.1'}, "unknown fault 'wrong 0.1'"),
-    ({'fault': ['off']}, 'unknown fault'),
-    ({'fault': None}, 'unknown fault None'),
-    ({'fault': True}, 'unknown fault True'),
-    ({'value': 4.0}, 'angle of wrong of link_b must be from -3.14159 to 3.14159 rad, got 4'),
-    ({'value': 'much'}, "must be a number, got 'much'"),
-    ({'fault': 'intermittent', 'value': 1.5}, 'probability of .* 0 to 1, got 1.5'),
-    ({'at': -0.1}, 'at must be from 0 to 1e.09 s, got -0.1'),
-    ({'at': nan}, 'at must be from 0 to .* got nan'),
-    ({'at': '2'}, "at must be a number of seconds, got '2'"),
-    ({'at': None}, 'at must be a number of seconds, got None'),
-    ({'at': True}, 'at must be a number of seconds, got True'),
-    ({'until': 2.0}, 'until 2.0 s must be later than at 2.0 s'),
-    ({'until': 1.9}, 'until 1.9 s must be later than at 2.0 s'),
-    ({'until': inf}, 'until must be from 0 to .* got inf'),
-    ({'til': 3.0}, 'unknown til .*known are at, fault, target, until, value'),
+@pytest.mark.parametrize(('changed', 'values'), [
+    ({'target': 'link_e'}, {'name': 'target', 'value': 'link_e'}),
+    ({'target': 'joint_1'}, {'name': 'target', 'value': 'joint_1', 'limit': TARGETS}),
+    ({'target': ['link_a']}, {'name': 'target', 'value': ['link_a']}),
+    ({'fault': 'broken'}, {'name': 'link_b', 'value': 'broken', 'limit': tuple(SENSOR_FAULTS)}),
+    ({'fault': 'wrong 0.1'}, {'name': 'link_b', 'value': 'wrong 0.1'}),
+    ({'fault': ['off']}, {'name': 'link_b', 'value': ['off']}),
+    ({'fault': None}, {'name': 'link_b', 'value': None}),
+    ({'fault': True}, {'name': 'link_b', 'value': True}),
+    ({'value': 4.0}, {'name': 'link_b.wrong', 'value': 4.0, 'limit': (-pi, pi)}),
+    ({'value': 'much'}, {'name': 'link_b.wrong', 'value': 'much', 'limit': float}),
+    ({'fault': 'intermittent', 'value': 1.5},
+     {'name': 'link_b.intermittent', 'value': 1.5, 'limit': (0.0, 1.0)}),
+    ({'at': -0.1}, {'name': 'at', 'value': -0.1, 'limit': (0.0, LATEST_S)}),
+    ({'at': nan}, {'name': 'at', 'limit': (0.0, LATEST_S)}),
+    ({'at': '2'}, {'name': 'at', 'value': '2', 'limit': float}),
+    ({'at': None}, {'name': 'at', 'value': None, 'limit': float}),
+    ({'at': True}, {'name': 'at', 'value': True, 'limit': float}),
+    ({'until': 2.0}, {'name': 'until', 'value': 2.0, 'limit': 2.0}),
+    ({'until': 1.9}, {'name': 'until', 'value': 1.9, 'limit': 2.0}),
+    ({'until': inf}, {'name': 'until', 'value': inf, 'limit': (0.0, LATEST_S)}),
+    ({'til': 3.0}, {'unknown': ['til']}),
 ])
-def test_bad_entry_is_refused_by_its_number(changed: dict[str, Any], message: str) -> None:
-    with pytest.raises(FaultError, match=f'^run.yaml, entry 2: .*{message}'):
+def test_bad_entry_is_refused_by_its_number(
+    changed: dict[str, Any], values: dict[str, Any], refuses: Refuses,
+) -> None:
+    with refuses(FaultError, place='run.yaml, entry 2', **values):
         parse_schedule([DEAD, entry(**changed)], TARGETS, 'run.yaml')
 
 
 @pytest.mark.parametrize('key', ['at', 'target', 'fault'])
-def test_missing_key_is_named(key: str) -> None:
+def test_missing_key_is_named(key: str, refuses: Refuses) -> None:
     lacking = {name: value for name, value in WRONG.items() if name != key}
-    with pytest.raises(FaultError, match=f'^run.yaml, entry 1: {key} missing$'):
+    with refuses(FaultError, place='run.yaml, entry 1', missing=[key]):
         parse_schedule([lacking], TARGETS, 'run.yaml')
 
 
 @pytest.mark.parametrize('bad', [3, 'link_a off', None, ['link_a', 'off']])
-def test_entry_that_is_no_mapping_is_refused(bad: Any) -> None:
-    with pytest.raises(FaultError, match='entry 1 must be a mapping with at, target and fault'):
+def test_entry_that_is_no_mapping_is_refused(bad: Any, refuses: Refuses) -> None:
+    with refuses(FaultError, entry=1, value=bad, limit=dict):
         parse_schedule([bad], TARGETS, 'run.yaml')
 
 
 @pytest.mark.parametrize('bad', [WRONG, 'off', None, 3])
-def test_schedule_that_is_no_list_is_refused(bad: Any) -> None:
-    with pytest.raises(FaultError, match='^run.yaml: a schedule of faults must be a list'):
+def test_schedule_that_is_no_list_is_refused(bad: Any, refuses: Refuses) -> None:
+    with refuses(FaultError, place='run.yaml', value=bad, limit=list):
         parse_schedule(bad, TARGETS, 'run.yaml')
 
 
-def test_past_is_refused_and_now_is_not() -> None:
+def test_past_is_refused_and_now_is_not(refuses: Refuses) -> None:
     assert parse_schedule([WRONG], TARGETS, 'here', 2 * S)
-    with pytest.raises(FaultError, match='entry 1: at 2.0 s lies in the past, it is 2.5 s now'):
+    with refuses(FaultError, place='here, entry 1', name='at', value=2.0, limit=2.5):
         parse_schedule([WRONG], TARGETS, 'here', 2 * S + S // 2)
 
 
 @pytest.mark.parametrize(('at', 'until'), [
     (2.0, 5.0), (1.0, 2.5), (4.999, 6.0), (3.0, 4.0), (1.0, 6.0), (1.0, None), (4.0, None)])
 def test_overlap_on_one_target_is_refused_with_both_numbers(
-    at: float, until: float | None,
+    at: float, until: float | None, refuses: Refuses,
 ) -> None:
-    with pytest.raises(FaultError, match='entry 3: overlaps with entry 2 on link_b'):
+    with refuses(FaultError, entry=3, overlaps=2, name='link_b'):
         parse_schedule([DEAD, WRONG, entry(at=at, until=until)], TARGETS, 'here')
 
 
-def test_nothing_may_follow_what_stays_for_ever() -> None:
-    with pytest.raises(FaultError, match='entry 2: overlaps with entry 1 on flywheel_a'):
+def test_no_fault_may_follow_one_without_end(refuses: Refuses) -> None:
+    with refuses(FaultError, entry=2, overlaps=1, name='flywheel_a'):
         parse_schedule([DEAD, {**DEAD, 'at': 100}], TARGETS, 'here')
 
 
@@ -215,14 +221,13 @@ def test_faults_may_follow_each_other_at_once(at: float, until: float | None) ->
     assert len(parse_schedule([WRONG, entry(at=at, until=until)], TARGETS, 'here')) == 2
 
 
-@pytest.mark.parametrize(('action', 'message'), [
-    (lambda board: board.set_fault('link_e', None), "'link_e'"),
-    (lambda board: board.set_fault('joint_1', Fault('joint_1', 'off')), 'no joint_1 here'),
-    (lambda board: board.set_fault('link_a', Fault('link_b', 'off')), 'link_b cannot be one of'),
-])
-def test_fault_by_hand_of_something_else_is_refused(
-    action: Callable[[FaultBoard], None], message: str, board: FaultBoard,
+@pytest.mark.parametrize(('target', 'fault', 'name', 'value'), [
+    ('link_e', None, 'target', 'link_e'),
+    ('joint_1', Fault('joint_1', 'off'), 'target', 'joint_1'),
+    ('link_a', Fault('link_b', 'off'), 'link_a', 'link_b')])
+def test_fault_by_hand_of_another_target_is_refused(
+    target: str, fault: Fault | None, name: str, value: str, board: FaultBoard, refuses: Refuses,
 ) -> None:
-    with pytest.raises(FaultError, match=message):
-        action(board)
+    with refuses(FaultError, name=name, value=value):
+        board.set_fault(target, fault)
     assert not board.faults

@@ -4,10 +4,12 @@
 """What link sensors make of the truth, when they say it, and what their faults do to it."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
 from math import inf, nan, pi
 from typing import Any
 
+from fourbar_ros.common.settings import SettingError
 from fourbar_ros.mechanism import LINK_NAMES
 from fourbar_ros.plant.faults import Fault, parse_fault, SENSOR_FAULTS
 from fourbar_ros.plant.sensors import (
@@ -25,6 +27,7 @@ from scipy import stats
 
 Array = NDArray[np.float64]
 
+Refuses = Callable[..., AbstractContextManager[None]]
 MS = 1_000_000
 S = 1000 * MS
 PERIOD = 4 * MS
@@ -351,10 +354,10 @@ def test_next_sample_is_told() -> None:
 
 
 @pytest.mark.parametrize('later', [0, -1, -S])
-def test_time_that_does_not_go_on_is_refused(later: int) -> None:
+def test_time_that_does_not_increase_is_refused(later: int, refuses: Refuses) -> None:
     sensors = make(PERFECT)
     sensors.measure(S, ANGLES, RATES)
-    with pytest.raises(SensorError, match=f'{S + later} ns cannot follow one at {S} ns'):
+    with refuses(SensorError, value=S + later, limit=S):
         sensors.measure(S + later, ANGLES, RATES)
 
 
@@ -614,72 +617,71 @@ NEVER_NEGATIVE = [name for name in NUMBERS if name not in ('bias', 'gyro_bias', 
 
 @pytest.mark.parametrize('name', NUMBERS)
 @pytest.mark.parametrize('value', [nan, inf, -inf, 1e300, '1', True, None, {}])
-def test_bad_value_is_refused_by_name(name: str, value: Any) -> None:
-    with pytest.raises(SensorError, match=f'^link_sensors.{name} must be '):
+def test_bad_value_is_refused_by_name(name: str, value: Any, refuses: Refuses) -> None:
+    with refuses(SettingError, name=f'link_sensors.{name}'):
         LinkSensorSettings(**{name: value})
 
 
 @pytest.mark.parametrize('name', NEVER_NEGATIVE)
-def test_negative_value_is_refused_with_the_limit(name: str) -> None:
-    with pytest.raises(SensorError, match=f'link_sensors.{name} must be from 0 to .*got -1e-12'):
-        LinkSensorSettings(**{name: -1e-12})
+def test_negative_value_is_refused(name: str, refuses: Refuses) -> None:
+    value = -1 if name == 'counts_per_turn' else -1e-12
+    with refuses(SettingError, name=f'link_sensors.{name}', value=value):
+        LinkSensorSettings(**{name: value})
 
 
-def test_probability_above_1_is_refused() -> None:
-    with pytest.raises(SensorError, match='link_sensors.dropout must be from 0 to 1, got 1.01'):
+def test_probability_above_1_is_refused(refuses: Refuses) -> None:
+    with refuses(SettingError, name='link_sensors.dropout', value=1.01, limit=(0.0, 1.0)):
         LinkSensorSettings(dropout=1.01)
 
 
 @pytest.mark.parametrize('name', [name for name in NUMBERS if 'bias' not in name])
-def test_a_list_where_one_number_is_needed_is_refused(name: str) -> None:
-    with pytest.raises(SensorError, match=f'link_sensors.{name} must be a number'):
+def test_a_list_where_one_number_is_needed_is_refused(name: str, refuses: Refuses) -> None:
+    with refuses(SettingError, name=f'link_sensors.{name}', value=[0.1] * 4):
         LinkSensorSettings(**{name: [0.1] * 4})
 
 
-def test_half_a_count_is_refused() -> None:
-    with pytest.raises(SensorError, match='counts_per_turn must be a whole number, got 16.5'):
+def test_half_a_count_is_refused(refuses: Refuses) -> None:
+    with refuses(SettingError, name='link_sensors.counts_per_turn', value=16.5, limit=int):
         LinkSensorSettings(counts_per_turn=16.5)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize('kind', ['relative', '', None, True, ['joint']])
-def test_unknown_kind_is_refused_with_those_known(kind: Any) -> None:
-    with pytest.raises(SensorError, match='kind must be one of absolute, joint, got'):
+def test_unknown_kind_is_refused(kind: Any, refuses: Refuses) -> None:
+    with refuses(SettingError, name='link_sensors.kind', value=kind):
         LinkSensorSettings(kind=kind)
 
 
 @pytest.mark.parametrize('heading', ['', None])
-def test_joint_encoders_without_heading_are_refused_with_the_reason(heading: Any) -> None:
-    with pytest.raises(SensorError, match='heading .*alone cannot observe attitude'):
+def test_joint_encoders_without_heading_are_refused(heading: Any, refuses: Refuses) -> None:
+    with refuses(SettingError, name='link_sensors.heading', limit=LINK_NAMES):
         LinkSensorSettings(kind='joint', heading=heading)
     assert LinkSensorSettings(kind='absolute', heading=heading).sensor_names == LINK_NAMES
 
 
 @pytest.mark.parametrize('kind', ['absolute', 'joint'])
 @pytest.mark.parametrize('heading', ['link_e', 'joint_1', 1, ['link_a']])
-def test_heading_that_is_no_link_is_refused(kind: str, heading: Any) -> None:
-    with pytest.raises(SensorError, match='heading must be one of link_a, .*link_d, got'):
+def test_heading_that_is_no_link_is_refused(kind: str, heading: Any, refuses: Refuses) -> None:
+    with refuses(SettingError, name='link_sensors.heading'):
         LinkSensorSettings(kind=kind, heading=heading)
 
 
 @pytest.mark.parametrize('gyro', [1, 'yes', None, 0.0])
-def test_gyro_that_is_neither_true_nor_false_is_refused(gyro: Any) -> None:
-    with pytest.raises(SensorError, match='gyro must be true or false, got'):
+def test_gyro_that_is_neither_true_nor_false_is_refused(gyro: Any, refuses: Refuses) -> None:
+    with refuses(SettingError, name='link_sensors.gyro', value=gyro, limit=bool):
         LinkSensorSettings(gyro=gyro)
 
 
 @pytest.mark.parametrize('name', ['bias', 'gyro_bias'])
 @pytest.mark.parametrize(('kind', 'size', 'needed'), [
-    ('absolute', 3, r'4 \(link_a, .*link_d\)'), ('absolute', 0, r'4 \(link_a, .*link_d\)'),
-    ('absolute', 5, r'4 \(link_a, .*link_d\)'), ('joint', 4, r'5 \(joint_1, .*link_a\)')])
+    ('absolute', 3, 4), ('absolute', 0, 4), ('absolute', 5, 4), ('joint', 4, 5)])
 def test_biases_that_are_not_one_for_each_are_refused(
-    name: str, kind: str, size: int, needed: str,
+    name: str, kind: str, size: int, needed: int, refuses: Refuses,
 ) -> None:
-    refusal = f'link_sensors.{name} must be one number or {needed}, got {size}'
-    with pytest.raises(SensorError, match=refusal):
+    with refuses(SettingError, name=f'link_sensors.{name}', value=size, limit=needed):
         LinkSensorSettings(kind=kind, **{name: [0.1] * size})
 
 
 @pytest.mark.parametrize('value', [nan, inf, '0.1', True, None, [0.1]])
-def test_one_bad_bias_is_refused_by_its_place(value: Any) -> None:
-    with pytest.raises(SensorError, match=r'link_sensors.bias\[2\] must be '):
+def test_one_bad_bias_is_refused_by_its_sensor(value: Any, refuses: Refuses) -> None:
+    with refuses(SettingError, name='link_sensors.bias.link_c'):
         LinkSensorSettings(bias=[0.0, 0.0, value, 0.0])  # type: ignore[arg-type]

@@ -1,11 +1,12 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A table file is taken as it stands or refused, with the name of what is wrong."""
+"""A table file is read as it stands, or refused by the name of the wrong key."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from copy import deepcopy
-from math import pi
+from math import inf, nan, pi
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from fourbar_ros.plant.table import quantum, WheelEncoders
 import pytest
 import yaml
 
+Refuses = Callable[..., AbstractContextManager[None]]
 GOOD = {
     'link_sensors': {'noise_rms': 1e-3, 'counts_per_turn': 4096},
     'wheel_encoders': {'counts_per_turn': 0},
@@ -59,64 +61,54 @@ def test_ideal_table_has_the_sensors_of_the_design() -> None:
 
 
 @each_value
-@pytest.mark.parametrize('value', [-1, float('nan'), float('inf'), '1', True, None, [1], {}])
+@pytest.mark.parametrize('value', [-1, nan, inf, '1', True, None, [1], {}])
 def test_bad_value_is_refused_by_name(
-    section: str, key: str, value: Any, written: Callable[[Any], str],
+    section: str, key: str, value: Any, written: Callable[[Any], str], refuses: Refuses,
 ) -> None:
     path = written(with_value(section, key, value))
-    with pytest.raises(TableError, match=rf'{section}\.{key} must') as caught:
+    same = pytest.approx(value, nan_ok=True) if isinstance(value, float) else value
+    with refuses(TableError, name=f'{section}.{key}', value=same, place=path):
         load_table(path)
-    assert path in str(caught.value)
 
 
 @pytest.mark.parametrize('section', list(GOOD))
-def test_half_a_count_is_refused(section: str, written: Callable[[Any], str]) -> None:
-    with pytest.raises(TableError, match=rf'{section}\.counts_per_turn must be a whole number'):
+def test_half_a_count_is_refused(
+    section: str, written: Callable[[Any], str], refuses: Refuses,
+) -> None:
+    with refuses(TableError, name=f'{section}.counts_per_turn', value=16.5, limit=int):
         load_table(written(with_value(section, 'counts_per_turn', 16.5)))
 
 
-def test_missing_key_is_named(written: Callable[[Any], str]) -> None:
-    with pytest.raises(TableError, match='wheel_encoders: counts_per_turn missing'):
+def test_missing_key_is_named(written: Callable[[Any], str], refuses: Refuses) -> None:
+    with refuses(TableError, missing=['counts_per_turn'], place='wheel_encoders'):
         load_table(written({**GOOD, 'wheel_encoders': {}}))
 
 
-@pytest.mark.parametrize(('key', 'value', 'word'), [
-    ('dropout', 1.5, 'from 0 to 1, got 1.5'), ('kind', 'sundial', 'one of absolute, joint'),
-    ('latency', -1e-3, 'from 0 to 10 s')])
-def test_bad_sensor_is_refused_with_the_file(
-    key: str, value: Any, word: str, written: Callable[[Any], str],
-) -> None:
-    path = written(with_value('link_sensors', key, value))
-    with pytest.raises(TableError, match=rf'link_sensors\.{key} must be {word}') as caught:
-        load_table(path)
-    assert path in str(caught.value)
-
-
-@pytest.mark.parametrize(('section', 'key', 'value', 'limits'), [
-    ('wheel_bearings', 'viscous', -1e-6, 'finite and not negative'),
-    ('wheel_bearings', 'coulomb', float('nan'), 'finite and not negative'),
-    ('wheel_bearings', 'static_ratio', 0.9, 'finite and at least 1'),
-    ('wheel_bearings', 'stribeck_speed', 0.0, 'finite and at least 1e-06'),
-    ('wheel_bearings', 'smoothing', 0.0, 'finite and at least 1e-06'),
-    ('joints', 'viscous', '1', 'a number'), ('joints', 'coulomb', True, 'a number'),
-    ('joints', 'static_ratio', float('inf'), 'finite and at least 1'),
-    ('joints', 'stribeck_rate', -0.1, 'finite and at least 1e-06'),
-    ('joints', 'smoothing', 0.0, 'finite and at least 1e-06'),
-    ('links', 'drag', -1.0, 'finite and not negative'),
-    ('links', 'spin_drag', None, 'a number'),
-    ('surface', 'tilt_x', 0.2, 'between -0.1 and 0.1'),
-    ('surface', 'tilt_y', float('nan'), 'between -0.1 and 0.1'),
-    ('surface', 'size_x', -1.0, 'finite and not negative'), ('surface', 'size_y', 0.0, 'positive'),
-    ('surface', 'restitution', 1.1, 'between 0 and 1'),
-    ('disturbance', 'torque_density', -1e-7, 'finite and not negative'),
-    ('disturbance', 'torque_walk', -1e-7, 'finite and not negative')])
+@pytest.mark.parametrize(('section', 'key', 'value', 'limit'), [
+    ('link_sensors', 'dropout', 1.5, (0.0, 1.0)),
+    ('link_sensors', 'kind', 'sundial', ('absolute', 'joint')),
+    ('link_sensors', 'latency', -1e-3, (0.0, 10.0)),
+    ('wheel_bearings', 'viscous', -1e-6, (0.0, inf)),
+    ('wheel_bearings', 'coulomb', nan, (0.0, inf)),
+    ('wheel_bearings', 'static_ratio', 0.9, (1.0, inf)),
+    ('wheel_bearings', 'stribeck_speed', 0.0, (1e-6, inf)),
+    ('wheel_bearings', 'smoothing', 0.0, (1e-6, inf)),
+    ('joints', 'viscous', '1', float), ('joints', 'coulomb', True, float),
+    ('joints', 'static_ratio', inf, (1.0, inf)), ('joints', 'stribeck_rate', -0.1, (1e-6, inf)),
+    ('joints', 'smoothing', 0.0, (1e-6, inf)), ('links', 'drag', -1.0, (0.0, inf)),
+    ('links', 'spin_drag', None, float), ('surface', 'tilt_x', 0.2, (-0.1, 0.1)),
+    ('surface', 'tilt_y', nan, (-0.1, 0.1)), ('surface', 'size_x', -1.0, (0.0, inf)),
+    ('surface', 'size_y', 0.0, (0.0, inf)), ('surface', 'restitution', 1.1, (0.0, 1.0)),
+    ('disturbance', 'torque_density', -1e-7, (0.0, inf)),
+    ('disturbance', 'torque_walk', -1e-7, (0.0, inf))])
 def test_bad_effect_is_refused_by_name_with_its_limit(
-    section: str, key: str, value: Any, limits: str, written: Callable[[Any], str],
+    section: str, key: str, value: Any, limit: Any, written: Callable[[Any], str],
+    refuses: Refuses,
 ) -> None:
     path = written({**GOOD, section: {key: value}})
-    with pytest.raises(TableError, match=rf'{section}\.{key} must be {limits}') as caught:
+    same = pytest.approx(value, nan_ok=True) if isinstance(value, float) else value
+    with refuses(TableError, name=f'{section}.{key}', value=same, limit=limit, place=path):
         load_table(path)
-    assert path in str(caught.value)
 
 
 def test_what_is_left_out_does_not_act(written: Callable[[Any], str]) -> None:
@@ -136,31 +128,37 @@ def test_prototype_table_has_the_effects_of_the_design() -> None:
 
 
 @pytest.mark.parametrize('section', list(GOOD))
-def test_missing_section_is_named(section: str, written: Callable[[Any], str]) -> None:
+def test_missing_section_is_named(
+    section: str, written: Callable[[Any], str], refuses: Refuses,
+) -> None:
     content = {name: keys for name, keys in GOOD.items() if name != section}
-    with pytest.raises(TableError, match=f'{section} missing'):
+    with refuses(TableError, missing=[section]):
         load_table(written(content))
 
 
 @pytest.mark.parametrize('section', list(GOOD))
-def test_section_that_is_none_is_refused(section: str, written: Callable[[Any], str]) -> None:
-    with pytest.raises(TableError, match=f'{section} must be a section'):
+def test_section_without_keys_is_refused(
+    section: str, written: Callable[[Any], str], refuses: Refuses,
+) -> None:
+    with refuses(TableError, name=section, value=3, limit=dict):
         load_table(written({**GOOD, section: 3}))
 
 
-def test_unknown_section_is_named(written: Callable[[Any], str]) -> None:
-    with pytest.raises(TableError, match='unknown joint_friktion'):
+def test_unknown_section_is_named(written: Callable[[Any], str], refuses: Refuses) -> None:
+    with refuses(TableError, unknown=['joint_friktion']):
         load_table(written({**GOOD, 'joint_friktion': {}}))
 
 
 @pytest.mark.parametrize('section', list(GOOD))
-def test_unknown_key_is_named(section: str, written: Callable[[Any], str]) -> None:
-    with pytest.raises(TableError, match=f'{section}: unknown nois_rms'):
+def test_unknown_key_is_named(
+    section: str, written: Callable[[Any], str], refuses: Refuses,
+) -> None:
+    with refuses(TableError, unknown=['nois_rms'], place=section):
         load_table(written(with_value(section, 'nois_rms', 1)))
 
 
-def test_missing_file_is_named() -> None:
-    with pytest.raises(ConfigurationError, match='no_such_table'):
+def test_missing_file_is_refused() -> None:
+    with pytest.raises(ConfigurationError):
         load_table('no_such_table')
 
 
