@@ -138,15 +138,15 @@ def test_schedule_of_the_page_is_one(tmp_path: Path) -> None:
 
 
 def test_entries_of_the_accounts_are_told() -> None:
-    assert list(table_under('## The accounts')) == [item.name for item in fields(EnergyBudget)]
+    assert list(table_under('## Energy budget')) == [item.name for item in fields(EnergyBudget)]
 
 
 @pytest.mark.parametrize('heading', ['## Motors', '## Mechanisms'])
 def test_mechanisms_are_told(heading: str) -> None:
     """Every value of the presets; their four links are alike."""
     presets = [load_yaml(config_file('mechanism', name)) for name in ('paper', 'prototype')]
-    defaults = {item.name: item.default_factory()[0] for item in fields(Mechanism)
-                if item.default_factory is not MISSING}
+    defaults = {item.name: item.default[0] for item in fields(Mechanism)
+                if item.default is not MISSING}
     told = table_under(heading)
     for key, cells in told.items():
         if key == 'motor_*':

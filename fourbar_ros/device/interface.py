@@ -80,7 +80,7 @@ class TrueState:
     :param wheel_angles: (4,) relative to the link, unwrapped [rad].
     :param wheel_speeds: (4,) relative to the link [rad/s].
     :param efforts: (4,) torque of each motor, mean over the last control period [N m].
-    :param walked_torques: (2,) random-walk torques on links a and b in that period [N m].
+    :param random_walk_torques: (2,) random-walk torques on links a and b in that period [N m].
     :param centre_position: (2,) centre of mass of the whole in frame `table` [m].
     :param centre_velocity: (2,) [m/s].
     :param base_position: (2,) joint 1, the origin of the frame of link a [m].
@@ -92,7 +92,7 @@ class TrueState:
     wheel_angles: Array
     wheel_speeds: Array
     efforts: Array
-    walked_torques: Array
+    random_walk_torques: Array
     centre_position: Array
     centre_velocity: Array
     base_position: Array

@@ -1,4 +1,4 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Compilation of the numerical kernels, and small algebra that they share."""
+"""Compilation of the numerical kernels, their linear algebra and their Runge-Kutta step."""

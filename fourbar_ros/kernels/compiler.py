@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Compile the numerical kernels, and keep the machine code where it cannot go stale.
+Compile the numerical kernels, and cache the machine code under a hash of its sources.
 
-Numba checks its cache against the file of the compiled function alone, so an edited callee in
-another module would go unnoticed, and it refuses to import at all where no folder is writable.
-So the code is kept in the user's cache folder under a hash of everything it is made from. Set
-NUMBA_CACHE_DIR to choose a folder of your own, which is then yours to clear.
+Numba checks its cache against the file of the compiled function alone: an edited callee in another
+module would go unnoticed. And it refuses to import where no folder is writable. So the code is
+cached in the user's cache folder under a hash of all sources and versions. NUMBA_CACHE_DIR selects
+another folder, which the user has to clear.
 """
 
 from collections.abc import Callable, Iterator
@@ -55,7 +55,7 @@ def kernel(**options: Any) -> Callable[[_Function], _Function]: ...
 
 def kernel(function: _Function | None = None, /, **options: Any) -> Any:
     """
-    Compile a function with numba in nopython mode, and keep the code.
+    Compile a function with numba in nopython mode, and cache the code.
 
     Use it bare or with options of `numba.njit`: `@kernel`, `@kernel(parallel=True)`. Division by
     zero gives inf or nan as in numpy, and floating point is not reordered.
@@ -71,12 +71,12 @@ def kernel(function: _Function | None = None, /, **options: Any) -> Any:
 @contextlib.contextmanager
 def announced(stream: TextIO | None = None) -> Iterator[None]:
     """
-    Say it, while the block runs, when kernels have to be compiled, and which.
+    Print a line if the block compiles kernels.
 
-    Nothing is said where the machine code comes from the cache. On a terminal one line shows the
-    kernel at work and is wiped at the end.
+    Code from the cache prints nothing. On a terminal a second line shows the present kernel; it is
+    cleared at the end.
 
-    :param stream: where to, by default stderr.
+    :param stream: by default stderr.
     """
     show = _Announcement(stream or sys.stderr)
     with event.install_listener('numba:compile', show):
@@ -87,7 +87,7 @@ def announced(stream: TextIO | None = None) -> Iterator[None]:
 
 
 class _Announcement(event.Listener):  # type: ignore[misc]
-    """Shows the outermost function that is being compiled."""
+    """Prints the outermost function that is being compiled."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -103,10 +103,10 @@ class _Announcement(event.Listener):  # type: ignore[misc]
             print(f'\r  {self._done:3d} {name:<40}', end='', file=self._stream, flush=True)
 
     def on_end(self, occasion: event.Event) -> None:
-        """Leave the line: the next kernel overwrites it."""
+        """Keep the line: the next kernel overwrites it."""
 
     def finish(self) -> None:
-        """Wipe the line."""
+        """Clear the line."""
         if self._done and self._stream.isatty():
             print(f'\r{"":<44}\r', end='', file=self._stream, flush=True)
 
@@ -114,35 +114,35 @@ class _Announcement(event.Listener):  # type: ignore[misc]
 @functools.lru_cache(maxsize=None)
 def cache_directory() -> Path | None:
     """
-    Return the folder of the compiled code: None when nothing is writable and nothing is kept.
+    Return the folder of the compiled code, None if no folder is writable.
 
-    Where the user's cache is not writable it is a private folder for temporary files, with a
-    warning.
+    If the user's cache is not writable, the folder is a private one for temporary files; a warning
+    is logged.
     """
     name = _fingerprint()
     if numba.config.CACHE_DIR:
-        wanted = Path(numba.config.CACHE_DIR)
+        preferred = Path(numba.config.CACHE_DIR)
     else:
-        wanted = _user_cache() / name
-        _drop_unused(wanted)
+        preferred = _user_cache() / name
+        _drop_unused(preferred)
     with contextlib.suppress(OSError):
-        return _writable(wanted)
+        return _writable(preferred)
     logger = logging.getLogger(__name__)
     with contextlib.suppress(OSError):
         directory = _writable(_private_temporary() / name)
-        logger.warning('cannot write to %s: compiled code is kept in %s', wanted, directory)
+        logger.warning('cannot write to %s: compiled code is kept in %s', preferred, directory)
         return directory
-    logger.warning('cannot write to %s nor to a temporary folder: every start compiles', wanted)
+    logger.warning('cannot write to %s nor to a temporary folder: every start compiles', preferred)
     return None
 
 
 @contextlib.contextmanager
 def _numba_caches_in(directory: Path | None) -> Iterator[None]:
     """
-    Tell numba where to cache, for one decoration.
+    Set numba's cache folder for one decoration.
 
-    Through its configuration and not the environment: children may run other sources. And not for
-    longer, so that other people's compiled functions stay where they expect them.
+    The configuration is used, not the environment, since child processes may run other sources. It
+    is restored, so that compiled functions of other packages stay in their own caches.
     """
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(directory or '')
@@ -153,7 +153,7 @@ def _numba_caches_in(directory: Path | None) -> Iterator[None]:
 
 
 def _fingerprint() -> str:
-    """Return a name for all that the machine code depends on, the processor excepted."""
+    """Return a hash of all that the machine code depends on, except the processor."""
     digest = hashlib.sha256()
     for version in (platform.python_version(), numba.__version__, numpy.__version__):
         digest.update(version.encode() + b'\0')
@@ -166,7 +166,7 @@ def _fingerprint() -> str:
 
 
 def _writable(directory: Path) -> Path:
-    """Make the folder, mark it as used now, and raise OSError unless a file can be written."""
+    """Make the folder and set its time of use; raise OSError unless it is writable."""
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=directory).close()
     os.utime(directory)
@@ -177,8 +177,8 @@ def _private_temporary() -> Path:
     """
     Return this user's folder for temporary files.
 
-    Numba unpickles what it finds in its cache, so a folder that someone else could have made
-    under the same name must not be used.
+    Numba unpickles the files of its cache, so a folder of another user under the same name must
+    not be used.
     """
     directory = Path(tempfile.gettempdir()) / f'fourbar_ros-{os.getuid()}'
     with contextlib.suppress(FileExistsError):
@@ -196,7 +196,7 @@ def _user_cache() -> Path:
 
 
 def _drop_unused(in_use: Path) -> None:
-    """Remove the folders of other versions that nobody has used for UNUSED_AFTER seconds."""
+    """Remove the folders of other versions that were not used for UNUSED_AFTER seconds."""
     oldest = time.time() - UNUSED_AFTER
     with contextlib.suppress(OSError):
         for directory in in_use.parent.iterdir():

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What the linkage is: parameters, closure and branches, Kane dynamics, momentum, energy.
+The linkage: parameters, closure and branches, Kane dynamics, momentum, energy.
 
 Conventions are those of docs/mechanics.md: links a, b, c, d in this order, link angle = angle of
 the link's x axis in the table frame, wheel speed relative to its link unless called absolute.

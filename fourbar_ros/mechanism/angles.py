@@ -21,10 +21,10 @@ def wrap(angle: float) -> float:
 
 
 def wrap_angles(angles: ArrayLike) -> Array:
-    """Bring angles [rad] of any shape into (-pi, pi]; what is there already stays bit for bit."""
-    given = np.asarray(angles, dtype=float)
-    if (np.abs(given) < pi).all():
-        return given
-    wrapped = pi - (pi - given) % (2.0 * pi)
-    inside = (given > -pi) & (given <= pi)
-    return np.where(inside, given, np.where(wrapped <= -pi, pi, wrapped))
+    """Bring angles [rad] of any shape into (-pi, pi]; those inside keep all bits."""
+    values = np.asarray(angles, dtype=float)
+    if (np.abs(values) < pi).all():
+        return values
+    wrapped = pi - (pi - values) % (2.0 * pi)
+    inside = (values > -pi) & (values <= pi)
+    return np.where(inside, values, np.where(wrapped <= -pi, pi, wrapped))

@@ -8,8 +8,8 @@ The file is JSON with the keys `mechanism` (those of a mechanism file), `initial
 and optionally `link_rates` and `flywheel_speeds_absolute`), `motor_torque` (`amplitude`,
 `frequency_hz`, `phase`: torque on the wheel = amplitude cos(2 pi frequency_hz t + phase)) and `t`.
 With `wheel_angle` (`flywheels`, and for each of them `amplitude`, `frequency_hz`, `phase`) some
-wheels move relative to their links as prescribed, instead of being driven by a torque. Other keys
-are ignored, so that a file may carry its expected result.
+wheels have a prescribed angle relative to their links instead of a torque. Other keys are ignored,
+so that a file may contain its expected result.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class CaseError(FourbarError):
 @dataclass(frozen=True, eq=False)
 class Case:
     """
-    One motion to simulate.
+    A motion to simulate.
 
     :param mechanism: the linkage.
     :param link_angles: (4,) initial angles on the closure [rad].
@@ -124,9 +124,9 @@ def simulate(case: Case, step: float = DEFAULT_STEP, around: Surroundings = NOTH
     Integrate the motion of a case.
 
     :param step: longest integration step [s].
-    :param around: what acts besides the motors.
+    :param around: forces besides those of the motors.
     :raises ClosureError: the linkage cannot be in the initial state.
-    :raises CaseError: the motion left the finite numbers.
+    :raises CaseError: the motion is no longer finite.
     """
     check_motion(case.mechanism, case.link_angles, case.link_rates)
     omega = 2.0 * np.pi * case.frequency_hz
@@ -171,7 +171,7 @@ def _case_from(values: Any) -> Case:
     try:
         check_motion(mechanism, angles, rates)
     except ClosureError as error:
-        raise error.at('initial', CaseError) from None
+        raise CaseError(f'initial: {error}', **error.values) from None
     return Case(mechanism, angles, rates, speeds, cosines[0], cosines[1], cosines[2], times,
                 prescribed)
 

@@ -2,12 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How well a linkage can be moved over its configurations, for many linkages at once.
+Conditioning of linkages over their configurations, for many linkages at once.
 
+<<<<<<< HEAD
 cond(A) of paper eq. 6 is one answer, and depends on which two angles are the axes. What does not:
 how near a change point is, which inertia the motions have, and what wheels can do. For these the
 motions that the closure admits, `J omega = 0`, are measured by the rates of all four links, in an
 orthonormal basis N of them (docs/studies/conditioning.md).
+=======
+cond(A) of paper eq. 6 depends on the choice of the two axes. The distance of a change point, the
+inertia of the motions and the effect of the wheels do not. These use the motions that the closure
+admits, `J omega = 0`, by the rates of all four links, in an orthonormal basis N (docs/studies.md,
+conditioning).
+>>>>>>> 7220711 (Declare table, sensors and fault settings by the schema)
 """
 
 from __future__ import annotations
@@ -25,29 +32,29 @@ from fourbar_ros.mechanism.reduced import close_loop, pair_inertias, reduced_ter
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Which wheels are left (11, 4): all, all but a, b, c or d, then pairs ab, ac, ad, bc, bd, cd.
+# Sets of working wheels (11, 4): all, all but a, b, c or d, then pairs ab, ac, ad, bc, bd, cd.
 WHEELS: NDArray[np.bool_] = np.array(
     [[True] * 4, *(np.arange(4) != lost for lost in range(4)),
      *([wheel in pair for wheel in range(4)] for pair in PAIRS)])
 
-NUMBERS = 4 + len(WHEELS)
+COLUMNS = 4 + len(WHEELS)
 
 
 @dataclass(frozen=True, eq=False)
 class Conditioning:
     """
-    How well linkages can be moved; arrays (m, n) of m linkages in n configurations.
+    Conditioning of m linkages in n configurations; arrays (m, n).
 
     All are NaN where the loop cannot close, and at a change point itself.
 
     :param condition: cond(A) of paper eq. 6, in the axes a and b. Grows without limit where links
         c and d fold onto a line, where Gamma does not exist.
     :param condition_of_motions: cond of the inertia of the motions, per rates of all four links.
-        The same whichever links are the axes.
+        It does not depend on the choice of the axes.
     :param alignment: `|sin(phi_d - phi_c)|`, which vanishes where Gamma does not exist.
     :param closure_ratio: smallest over largest singular value of the closure Jacobian J. It
         vanishes at change points and nowhere else.
-    :param gains: (m, n, 11) for the `WHEELS` that are left, what torques do along the motion
+    :param gains: (m, n, 11) for each set of `WHEELS`, the gain of their torques along the motion
         that they drive least, per link rate and in the metric of `min_energy`: the smallest
         singular value of `N^T diag(If / max If)^(1/2)`, N an orthonormal basis of the motions.
         From 0 (a motion that they do not drive) to 1.
@@ -67,20 +74,21 @@ def conditioning_grid(mechanisms: Sequence[Mechanism], thetas: ArrayLike, branch
 
     :param mechanisms: (m,) any lengths.
     :param thetas: (n,) `phi_b - phi_a` [rad]. At 0, where branches have no names, the side of
-        those above it is taken.
+        small positive angles applies.
     :param branch: `open` or `crossed`.
     :raises ClosureError: there is no such branch.
     """
     check_branch(branch)
     constants = np.array([mechanism.constants for mechanism in mechanisms])
-    found = _grid(constants, np.ascontiguousarray(thetas, dtype=float),
+    columns = _grid(constants, np.ascontiguousarray(thetas, dtype=float),
                   1.0 if branch == 'open' else -1.0, WHEELS.astype(float))
-    return Conditioning(found[..., 0], found[..., 1], found[..., 2], found[..., 3], found[..., 4:])
+    return Conditioning(columns[..., 0], columns[..., 1], columns[..., 2], columns[..., 3],
+                        columns[..., 4:])
 
 
 @kernel
 def _grid(constants: NDArray[np.record], thetas: Array, branch: float, wheels: Array) -> Array:
-    out = np.empty((constants.size, thetas.size, NUMBERS))
+    out = np.empty((constants.size, thetas.size, COLUMNS))
     for m in range(constants.size):
         for n in range(thetas.size):
             _evaluate(constants[m], cos(thetas[n]), sin(thetas[n]), branch, wheels, out[m, n])
@@ -90,7 +98,7 @@ def _grid(constants: NDArray[np.record], thetas: Array, branch: float, wheels: A
 @kernel
 def _evaluate(constants: Constants, cosine: float, sine: float, branch: float, wheels: Array,
               out: Array) -> None:
-    """Fill in the numbers of one linkage in one configuration (NUMBERS,)."""
+    """Set the columns (COLUMNS,) of one linkage in one configuration."""
     l_a, l_b, l_c, l_d = (constants.lengths[0], constants.lengths[1], constants.lengths[2],
                           constants.lengths[3])
     out[:] = nan
@@ -100,7 +108,7 @@ def _evaluate(constants: Constants, cosine: float, sine: float, branch: float, w
     x = (-l_a, l_b * cosine, links.cx, -links.dx)
     y = (0.0, l_b * sine, links.cy, -links.dy)
     first, second, determinant = motions(x, y)
-    # Written so that NaN, a loop that cannot close, leaves everything blank.
+    # Written so that NaN, a loop that cannot close, returns here.
     if not determinant > 0.0:
         return
     xx = xy = yy = 0.0
@@ -143,14 +151,14 @@ def _evaluate(constants: Constants, cosine: float, sine: float, branch: float, w
 @kernel
 def motions(x: Vector4, y: Vector4) -> tuple[Array, Array, float]:
     """
-    Work out an orthonormal basis of the link rates that the closure admits.
+    Evaluate an orthonormal basis of the link rates that the closure admits.
 
-    The minors of J, in dual order, make an antisymmetric Q that J annuls and that turns the plane
-    of the motions by a quarter, times the root of det(J J^T). So a small determinant costs few
+    The minors of J, in dual order, form an antisymmetric Q with J Q = 0. Q rotates the plane of
+    the motions by a quarter turn, times the root of det(J J^T). So a small determinant costs few
     digits.
 
     :param x, y: the links with their signs [m]; J = (-y; x).
-    :returns: two vectors (4,), and det(J J^T) [m^4]; no numbers where that vanishes.
+    :returns: two vectors (4,), and det(J J^T) [m^4]; NaN where that vanishes.
     """
     dual = np.zeros((4, 4))
     for i, k, m, n, sign in ((0, 1, 2, 3, 1.0), (0, 2, 1, 3, -1.0), (0, 3, 1, 2, 1.0),

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the compiled kernels need to know of a mechanism, worked out once in plain numpy."""
+"""The constants of a mechanism for the kernels, evaluated once in numpy."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ Fields = list[tuple[str, Any, tuple[int, ...]]]
 # angles is `M_jk = cosine_jk cos(phi_k - phi_j) + sine_jk sin(phi_k - phi_j)` with constant
 # `cosine` (symmetric, link inertias on the diagonal) and `sine` (antisymmetric).
 #
-# A wheel whose motion relative to its link is prescribed turns with the link as far as inertia
-# goes: its axial inertia is in `cosine`, and `prescribed` is 1.
+# A wheel with a prescribed motion relative to its link adds its axial inertia to the link: it is
+# in `cosine`, and `prescribed` is 1.
 FIELDS: Fields = [
     ('lengths', float, (4,)),               # m
     ('cosine', float, (4, 4)),              # kg m^2
@@ -52,7 +52,7 @@ FIELDS: Fields = [
     ('joint_stiffness', float, (4,)),       # N/m
     ('joint_damping', float, (4,)),         # N s/m
     ('fastest_joint_mode', float, ()),      # rad/s, upper bound
-    ('compliant', bool, ()),                # whether the joints give
+    ('compliant', bool, ()),                # whether the joints are compliant
 ]
 
 # A scalar of `FIELDS`; numba knows its fields by name.
@@ -70,14 +70,14 @@ def record(fields: Fields, **values: Any) -> np.record:
 
 def constants_of(mechanism: Mechanism, prescribed: Array) -> Constants:
     """
-    Work out the constants of a mechanism.
+    Evaluate the constants of a mechanism.
 
     :param prescribed: (4,) bool, wheels whose motion relative to their links is prescribed.
     """
     masses = mechanism.link_masses
     lengths = mechanism.link_lengths
     inertias = mechanism.link_inertias + np.where(prescribed, mechanism.flywheel_inertias, 0.0)
-    # Measured from joint 1; c hangs on b (joint 2), d hangs on a (joint 4).
+    # Relative to joint 1; c is attached to b (joint 2), d to a (joint 4).
     arms = np.zeros((4, 4, 2))
     arms[range(4), range(4)] = mechanism.com_positions
     arms[2, 1, 0] = lengths[1]
@@ -103,7 +103,7 @@ def constants_of(mechanism: Mechanism, prescribed: Array) -> Constants:
 
 def _fastest_joint_mode(mechanism: Mechanism) -> float:
     """
-    Bound the fastest motion that springs and dampers in the joints can cause [rad/s].
+    Bound the fastest motion that the springs and dampers of the joints can cause [rad/s].
 
     By Gershgorin's theorem on the blocks of J M^-1 J^T, two rows for each joint, weighted with
     the stiffness: the square of a frequency. Likewise with the damping: a decay rate.

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where joints and mass centres are, for drawings and for whoever needs positions."""
+"""Positions of joints and mass centres."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 def joint_positions(mechanism: Mechanism, link_angles: ArrayLike) -> Array:
     """
-    Place joints 1 to 4 relative to the mass centre of the whole linkage.
+    Evaluate the positions of joints 1 to 4 relative to the mass centre of the whole linkage.
 
     :param link_angles: (..., 4) [rad], on the closure.
     :returns: (..., 4, 2) positions in axes parallel to the table frame [m].
@@ -24,7 +24,7 @@ def joint_positions(mechanism: Mechanism, link_angles: ArrayLike) -> Array:
 
 def com_positions_in_table(mechanism: Mechanism, link_angles: ArrayLike) -> Array:
     """
-    Place the mass centre of each link relative to that of the whole linkage.
+    Evaluate the mass centre of each link relative to that of the whole linkage.
 
     :param link_angles: (..., 4) [rad], on the closure.
     :returns: (..., 4, 2) positions in axes parallel to the table frame [m].

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The flywheel motors: what torque they give for what they are asked, and how they follow a speed.
+The flywheel motors: limits and lag of their torque, and their speed loop.
 
-Bearings are not their matter.
+The friction of the bearings is in `plant.bearings`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fourbar_ros.mechanism.constants import Fields, record
 from fourbar_ros.mechanism.mechanism import Mechanism
 import numpy as np
 
-# Bandwidth of the loop in the motor's own electronics that follows a commanded speed [rad/s].
+# Bandwidth of the speed loop in the electronics of the motor [rad/s].
 SPEED_BANDWIDTH = 60.0
 
 FIELDS: Fields = [
@@ -46,26 +46,27 @@ def motor_values(mechanism: Mechanism) -> dict[str, Any]:
 
 
 def motors_of(mechanism: Mechanism) -> Motors:
-    """Collect the parameters of the four motors."""
+    """Return the parameters of the four motors."""
     return record(FIELDS, **motor_values(mechanism))
 
 
 @kernel
-def speed_loop(wheel: int, wanted: float, speed: float, integral: float, step: float,
+def speed_loop(wheel: int, target: float, speed: float, integral: float, step: float,
                motors: Motors) -> tuple[float, float]:
     """
-    Follow a commanded wheel speed as the motor's electronics do (PI, critically damped).
+    Control a wheel speed (PI, critically damped).
 
-    :param wanted, speed: relative to the link [rad/s].
-    :param integral: part of the torque that the loop has learnt [N m], NaN at the beginning.
-    :returns: torque to ask for [N m], and the new integral, which stands still in the limit.
+    :param target, speed: commanded and present speed relative to the link [rad/s].
+    :param integral: integral part of the torque [N m], NaN at the beginning.
+    :returns: commanded torque [N m], and the new integral, which is constant at the limit.
     """
     gain = SPEED_BANDWIDTH * motors.inertia[wheel]
-    error = wanted - speed
+    error = target - speed
     limit = motors.torque_limit[wheel]
     if isnan(integral) or ((gain * error + integral) * error > 0.0
                            and abs(gain * error + integral) >= limit):
-        # On the way in there is nothing to learn; from here the error dies out without overshoot.
+        # At the limit the integral has no information; from this value the error decays without
+        # overshoot.
         integral = -0.5 * gain * error
     torque = gain * error + integral
     if abs(torque) < limit:
@@ -74,15 +75,15 @@ def speed_loop(wheel: int, wanted: float, speed: float, integral: float, step: f
 
 
 @kernel
-def available_torque(wheel: int, asked: float, speed: float, motors: Motors) -> float:
+def available_torque(wheel: int, command: float, speed: float, motors: Motors) -> float:
     """
-    Limit a torque to what the motor can give [N m].
+    Limit a commanded torque to the range of the motor [N m].
 
-    That is its torque limit, what the supply voltage leaves beyond the back-EMF, and at the speed
-    limit nothing that would drive the wheel further into it.
+    The torque limit acts, then the supply voltage less the back-EMF. At the speed limit a torque
+    that would drive the wheel further is zero.
     """
     limit = motors.torque_limit[wheel]
-    torque = min(max(asked, -limit), limit)
+    torque = min(max(command, -limit), limit)
     if motors.resistance[wheel] > 0.0 and motors.voltage[wheel] < inf:
         constant = motors.torque_constant[wheel]
         slope, back = constant / motors.resistance[wheel], constant * speed
@@ -97,7 +98,7 @@ def available_torque(wheel: int, asked: float, speed: float, motors: Motors) -> 
 def lagged_torque(wheel: int, torque: float, target: float, step: float, motors: Motors
                   ) -> tuple[float, float]:
     """
-    Let the torque follow its target for a step.
+    Evaluate the lag of the torque towards its target over a step.
 
     :returns: mean over the step and value at its end [N m].
     """

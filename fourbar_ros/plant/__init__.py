@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the table does: the moving linkage, its flywheel motors and its sensors."""
+"""The simulated table: the moving linkage, its flywheel motors and its sensors."""
 
 from fourbar_ros.plant.faults import Fault, FaultError, parse_fault
 from fourbar_ros.plant.plant import Plant, PlantError, Truth

@@ -4,7 +4,7 @@
 """
 Friction of the wheel bearings.
 
-Within a step of the plant the torque is constant, at its mean; so impulse and work are exact.
+Within a step of the plant the torque is constant, its mean: so impulse and work are exact.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ MOST_ITERATIONS = 60
 # Share of the speed that friction may take in a step that uses the friction at its middle.
 MIDPOINT_LIMIT = 0.5
 
-# Those of the motors come last: numba takes a record that begins like another for one of its kind,
-# and warns.
+# The fields of the motors come last: numba warns about a record that begins like another record.
 FIELDS: Fields = [
     ('viscous', float, ()),             # N m s
     ('coulomb', float, ()),             # N m
@@ -36,7 +35,7 @@ FIELDS: Fields = [
 
 
 def drives_of(mechanism: Mechanism, bearings: WheelBearings) -> Motors:
-    """Collect the parameters of the four motors and of the bearings of their wheels."""
+    """Return the parameters of the four motors and of the bearings of their wheels."""
     return record(
         FIELDS, **motor_values(mechanism), viscous=bearings.viscous, coulomb=bearings.coulomb,
         static_ratio=bearings.static_ratio, stribeck_speed=bearings.stribeck_speed,

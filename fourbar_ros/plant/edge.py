@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The edge of the table: where a joint meets it the linkage stops or bounces."""
+"""Contacts of the joints with the edge of the table: the linkage stops or bounces."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def joint_motion(joint: int, state: Array, packed: NDArray[Any]
 def meet_edges(state: Array, half_x: float, half_y: float, restitution: float,
                constants: Constants, lever: Array) -> tuple[int, float, float]:
     """
-    Turn back every joint that moves out over an edge, by an impulse across the edge.
+    Apply an impulse across the edge to every joint that moves out over it, in place.
 
     Compliant joints are rigid for that instant; the changes of energy and momentum are then those
     of the state.

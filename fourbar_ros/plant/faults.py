@@ -47,25 +47,24 @@ class FaultKind:
 
 # Faults of a link sensor.
 SENSOR_FAULTS = {
-    'off': FaultKind('gives no sample'),
-    'stuck': FaultKind('repeats the last sample it gave, bit for bit, with new stamps'),
-    'garbage': FaultKind('gives any angle, all equally likely; the gyro goes on'),
+    'off': FaultKind('takes no samples'),
+    'stuck': FaultKind('repeats its last sample, bit for bit, with new stamps'),
+    'garbage': FaultKind('measures random angles, uniformly distributed; the gyro still works'),
     'wrong': FaultKind('adds a constant to the angle', 'angle', 'rad', 0.1, -pi, pi),
     'slow': FaultKind('low-passes the angle', 'time constant', 's', 0.2, 0.0, 10.0),
-    'delayed': FaultKind('gives its samples later', 'added latency', 's', 0.1, 0.0, 10.0),
+    'delayed': FaultKind('delivers its samples later', 'added latency', 's', 0.1, 0.0, 10.0),
     'intermittent': FaultKind('loses samples at random', 'probability', '', 0.5, 0.0, 1.0),
 }
 
-# Faults of a flywheel drive.
 WHEEL_FAULTS = {
-    'dead': FaultKind('the motor gives no torque'),
+    'dead': FaultKind('the motor produces no torque'),
     'stuck': FaultKind('a brake holds the wheel to its link', 'torque', 'N m', 0.1, 0.0, 10.0),
-    'weak': FaultKind('the motor gives a part of its torque', 'part', '', 0.5, 0.0, 1.0),
+    'weak': FaultKind('the motor produces a part of its torque', 'part', '', 0.5, 0.0, 1.0),
     'dragging': FaultKind('more friction in the bearing', 'torque', 'N m', 1e-4, 0.0, 10.0),
-    'runaway': FaultKind('while powered the motor gives this torque, as far as it can, whatever '
-                         'it is told', 'torque', 'N m', 10.0, -10.0, 10.0),
-    'shorted': FaultKind('the power stage gives this torque, as far as the motor can, and cannot '
-                         'be cut', 'torque', 'N m', 10.0, -10.0, 10.0),
+    'runaway': FaultKind('a powered motor produces this torque, within its limits, whatever its '
+                         'command', 'torque', 'N m', 10.0, -10.0, 10.0),
+    'shorted': FaultKind('the power stage produces this torque, within the limits of the motor, '
+                         'and cannot be cut', 'torque', 'N m', 10.0, -10.0, 10.0),
     'delayed': FaultKind('the motor follows its commands later', 'delay', 's', 0.05, 0.0, 1.0),
 }
 

@@ -60,7 +60,7 @@ class Tree:
             (self.root / room / '__init__.py').touch()
         (self.root / '__init__.py').touch()
         source = Path(compiler.__file__).read_text()
-        (self.root / 'mechanism' / 'compiler.py').write_text(source)
+        (self.root / 'kernels' / 'compiler.py').write_text(source)
         (self.root / 'mechanism' / 'caller.py').write_text(CALLER)
         (self.root / 'plant' / 'callee.py').write_text(CALLEE.format(factor=3.0))
 

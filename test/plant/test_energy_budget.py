@@ -249,7 +249,7 @@ def test_reset_opens_new_accounts(prototype: Mechanism, make_plant: MakePlant) -
     assert (ledger.supplied, ledger.bearings, ledger.unaccounted, ledger.contacts) == (0, 0, 0, 0)
     assert plant.truth().link_rates[:2].tolist() == [1.0, -0.5]
     with pytest.raises(PlantError):
-        plant.reset(InitialState(0.0, 0.0, rate_a=1.0))     # a change point
+        plant.reset(InitialState(0.0, np.pi, rate_a=1.0))   # a change point
     assert plant.truth().link_rates[:2].tolist() == [1.0, -0.5]
 
 
