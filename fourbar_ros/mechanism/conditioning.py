@@ -4,17 +4,10 @@
 """
 Conditioning of linkages over their configurations, for many linkages at once.
 
-<<<<<<< HEAD
-cond(A) of paper eq. 6 is one answer, and depends on which two angles are the axes. What does not:
-how near a change point is, which inertia the motions have, and what wheels can do. For these the
-motions that the closure admits, `J omega = 0`, are measured by the rates of all four links, in an
-orthonormal basis N of them (docs/studies/conditioning.md).
-=======
 cond(A) of paper eq. 6 depends on the choice of the two axes. The distance of a change point, the
 inertia of the motions and the effect of the wheels do not. These use the motions that the closure
-admits, `J omega = 0`, by the rates of all four links, in an orthonormal basis N (docs/studies.md,
-conditioning).
->>>>>>> 7220711 (Declare table, sensors and fault settings by the schema)
+admits, `J omega = 0`, by the rates of all four links, in an orthonormal basis N
+(docs/studies/conditioning.md).
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ STIFFEST = 1.0
 
 # Age of the random-walk torques at the first draw [s]. It sets their initial variance, which an
 # estimator assumes before the first measurement, too.
-RANDOM_WALK_AGE = 10.0
+TORQUE_WALK_AGE = 10.0
 
 # The relative rates in joints 1 to 4 from the rates of the links.
 RELATIVE_RATES = np.array(
@@ -210,7 +210,7 @@ class Plant:
             torques = self._generator.standard_normal(4) * (
                 disturbance.torque_density / np.sqrt(duration_s))
         if disturbance.torque_walk:
-            elapsed = (RANDOM_WALK_AGE if self._random_walk_for is None
+            elapsed = (TORQUE_WALK_AGE if self._random_walk_for is None
                        else self._random_walk_for)
             self._random_walk = self._random_walk + self._generator.standard_normal(2) * (
                 disturbance.torque_walk * np.sqrt(elapsed))

@@ -12,7 +12,7 @@ from fourbar_ros.mechanism.momentum import joint_gaps, linear_momentum, total_an
 from fourbar_ros.mechanism.state import LINK_RATES
 from fourbar_ros.plant import InitialState, load_table, Plant, PlantError, Table
 from fourbar_ros.plant.edge import joint_levers
-from fourbar_ros.plant.plant import RANDOM_WALK_AGE
+from fourbar_ros.plant.plant import TORQUE_WALK_AGE
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import (
     Disturbance,
@@ -169,7 +169,7 @@ def test_disturbances_walk_with_the_density_asked_for(
     for seed in range(200):
         plant = make_plant(prototype, table=table, seed=seed)
         plant.disturb(period)
-        begins.append(plant.truth().random_walk_torques / (density * np.sqrt(RANDOM_WALK_AGE)))
+        begins.append(plant.truth().random_walk_torques / (density * np.sqrt(TORQUE_WALK_AGE)))
     assert abs(np.square(begins).mean() - 1.0) < 4.0 * np.sqrt(2.0 / 400)
 
 

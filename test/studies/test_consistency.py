@@ -172,7 +172,7 @@ def test_matched_table_follows_the_model_of_the_filter(scenario: Scenario) -> No
     assert (table.disturbance.torque_density, table.disturbance.torque_walk) == (
         settings.disturbance_torque, settings.disturbance_walk)
     assert settings.disturbance_walk == scenario.estimator.disturbance_walk > 0.0
-    assert plant_module.RANDOM_WALK_AGE == estimation_filter.TORQUE_WALK_AGE
+    assert plant_module.TORQUE_WALK_AGE == estimation_filter.TORQUE_WALK_AGE
     assert (table.link_sensors.noise_rms, table.link_sensors.counts_per_turn) == (
         settings.angle_noise, settings.counts_per_turn)
     assert settings.gate == inf
