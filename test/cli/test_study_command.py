@@ -197,9 +197,9 @@ def test_progress_does_not_change_what_it_shows(stub: Stub, tmp_path: Path) -> N
 
 @pytest.mark.parametrize(('arguments', 'words'), [
     (['atlantis'], ["'atlantis'", *studies.STUDIES]),
-    (['consistency', '--runs', '0'], ['--runs', '1', '1000000', '0']),
-    (['consistency', '--jobs', '0'], ['--jobs', '1', '1024', '0']),
-    (['consistency', '--seed', '-1'], ['--seed', '0', '-1']),
+    (['consistency', '--runs', '0'], ['runs', '1', '0']),
+    (['consistency', '--jobs', '0'], ['jobs', '1', '1024', '0']),
+    (['consistency', '--seed', '-1'], ['seed', '0', '-1']),
     (['validation', '--runs', '5', '--seed', '1'], ['validation', '--runs', '--seed']),
     (['validation', '-o', 'file/folder'], ['file/folder']),
     (['validation', '--json', 'nowhere/v.json'], ['nowhere/v.json']),
