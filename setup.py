@@ -64,6 +64,7 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    package_data={PACKAGE: ['analysis/report.html']},
     zip_safe=False,
     install_requires=[
         'PyYAML',

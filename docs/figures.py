@@ -7,11 +7,15 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from fourbar_ros.analysis.calibration.calibration_figures import links_figure, wheels_figure
 from fourbar_ros.analysis.calibration.excitation import Excitation, MultiSine, SpinAndCoast
-from fourbar_ros.analysis.calibration.figure import links_figure, wheels_figure
-from fourbar_ros.analysis.calibration.links import link_estimate
-from fourbar_ros.analysis.calibration.signals import link_signal, LinkSignal, WheelSignal
-from fourbar_ros.analysis.calibration.wheels import wheel_estimate
+from fourbar_ros.analysis.calibration.link_identification import link_estimate
+from fourbar_ros.analysis.calibration.measurements import (
+    link_measurements,
+    LinkMeasurements,
+    WheelMeasurements,
+)
+from fourbar_ros.analysis.calibration.wheel_identification import wheel_estimate
 from fourbar_ros.control import Controller, ControllerSettings
 from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.device.interface import no_torque
@@ -364,7 +368,7 @@ def _draw_arrivals(axes: Axes, truth: dict[int, Array], samples: list[tuple[int,
     axes.legend(loc='upper left')
 
 
-def _record(excitation: Excitation, seed: int) -> tuple[LinkSignal, WheelSignal]:
+def _record(excitation: Excitation, seed: int) -> tuple[LinkMeasurements, WheelMeasurements]:
     """Drive the prototype on its table by an excitation, and keep what it says."""
     device = SimulatedTable(
         Plant(load_mechanism('prototype'), load_table('prototype'), InitialState(), 1e-3,
@@ -386,7 +390,7 @@ def _record(excitation: Excitation, seed: int) -> tuple[LinkSignal, WheelSignal]
             if asked is None:
                 break
             drive = drive_by_name(list(asked), (), (), list(asked.values()))
-    return link_signal(np.array(links), np.array(angles), 0), WheelSignal(
+    return link_measurements(np.array(links), np.array(angles), 0), WheelMeasurements(
         np.array(ticks), *(np.array([getattr(sample, name) for sample in wheels])
                            for name in ('angles', 'speeds', 'efforts')))
 

@@ -5,8 +5,11 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from importlib.util import module_from_spec, spec_from_file_location
 from itertools import count
 import os
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from fourbar_ros.common.errors import FourbarError
@@ -115,3 +118,14 @@ def refuses() -> Callable[..., AbstractContextManager[pytest.ExceptionInfo[Fourb
     `with refuses(TableError, name='joints.viscous', value=-1.0): ...`; wording is not compared.
     """
     return _refused
+
+
+@pytest.fixture(scope='session')
+def synthetic() -> ModuleType:
+    """Return the module that writes bags (tests are no package, so it cannot be imported)."""
+    path = Path(__file__).parent / 'analysis' / 'synthetic.py'
+    spec = spec_from_file_location('synthetic', path)
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

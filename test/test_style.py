@@ -39,7 +39,7 @@ MAY_IMPORT = {
     'device': (*_MECHANICS, 'plant'),
     'hardware': (*_MECHANICS, 'plant', 'device'),
     'loop': _CORE,
-    'plotting': ('common', 'analysis'),
+    'plotting': ('common',),
     'analysis': (*_CORE, 'loop', 'plotting'),
     'studies': _OFFLINE,
     'benchmarks': (*_OFFLINE, 'studies'),

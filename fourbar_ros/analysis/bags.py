@@ -1,46 +1,53 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Read rosbag2 directories (MCAP or SQLite) into plain numpy arrays, without ROS."""
+"""Read rosbag2 directories (MCAP or SQLite) into numpy arrays, without ROS."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.analysis.bag_reader import (
+    absolute_name,
+    bag_error,
+    BagError,
+    check_directory,
+    DIAGNOSTIC_STATUS,
+    JOINT_STATE,
+    open_bag,
+)
 from fourbar_ros.common.names import ESTIMATE_LINK_STATES, SIM_FLYWHEEL_STATES, SIM_LINK_STATES
+from fourbar_ros.common.progress import no_progress, Progress
 import numpy as np
 from numpy.typing import NDArray
 
-JOINT_STATE = 'sensor_msgs/msg/JointState'
-DIAGNOSTIC_STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'
-
-# Relative names that end in another name of the API: /sim/flywheel_states is not the
-# flywheel_states of a suite in the namespace /sim unless the caller says so.
+# /sim/flywheel_states is not the flywheel_states of a suite in the namespace /sim, unless the
+# caller selects that namespace.
 _LONGER_NAMES = (SIM_LINK_STATES, SIM_FLYWHEEL_STATES, ESTIMATE_LINK_STATES)
+# Longest interval between messages that is interpolated, in median intervals.
+LARGEST_GAP = 3.0
 
 Floats = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
-
-
-class BagError(FourbarError):
-    """A recording that cannot be read, or that lacks what was asked of it."""
+_FIELDS = ('position', 'velocity', 'effort')
 
 
 @dataclass(frozen=True)
 class JointSeries:
     """
-    The n messages of one JointState topic as arrays; what a message leaves out is NaN.
+    The n messages of one JointState topic as arrays; a value that a message lacks is NaN.
 
     :param topic: absolute name.
-    :param stamp_ns: (n,) header stamps.
-    :param received_ns: (n,) recorder time, good for order only.
-    :param names: the k names that occur.
-    :param position: (n, k); so are velocity and effort.
+    :param stamp_ns: (n,) header stamps [ns].
+    :param received_ns: (n,) recorder time [ns]; use it for the order of messages only.
+    :param names: the k joint names that occur.
+    :param position: (n, k) [rad].
+    :param velocity: (n, k) [rad/s].
+    :param effort: (n, k) [N m].
     """
 
     topic: str
@@ -56,76 +63,61 @@ class JointSeries:
         return len(self.stamp_ns)
 
     def rows(self, index: Any) -> JointSeries:
-        """Return the messages that a numpy index picks."""
-        return JointSeries(
-            self.topic, self.stamp_ns[index], self.received_ns[index], self.names,
-            self.position[index], self.velocity[index], self.effort[index])
+        """Return the messages at a numpy index."""
+        return replace(self, **{name: getattr(self, name)[index]
+                                for name in ('stamp_ns', 'received_ns', *_FIELDS)})
 
     def by_stamp(self) -> JointSeries:
-        """Return the messages in order of their stamps; of equal stamps the first to arrive."""
+        """Return the messages in order of stamps; of equal stamps the first to arrive."""
         return self.rows(np.unique(self.stamp_ns, return_index=True)[1])
 
     def between(self, start_ns: int, end_ns: int) -> JointSeries:
         """Return the messages with start_ns <= stamp <= end_ns."""
         return self.rows((self.stamp_ns >= start_ns) & (self.stamp_ns <= end_ns))
 
-    def at(self, stamp_ns: Nanoseconds) -> JointSeries:
+    def interpolated(self, stamp_ns: Nanoseconds) -> JointSeries:
         """
-        Return what lies between the messages, on a straight line from one to the next.
+        Return values at other stamps, by linear interpolation.
 
-        :param stamp_ns: (m,) stamps; those before the first message or after the last are left
-            out, and so are those between two that are further apart than three times the usual.
+        :param stamp_ns: (m,) stamps [ns]. A stamp before the first message, after the last, or
+            in an interval longer than `LARGEST_GAP` is left out.
         """
-        steps = np.diff(self.stamp_ns)
+        intervals = np.diff(self.stamp_ns)
         after = np.searchsorted(self.stamp_ns, stamp_ns)
         inside = (after > 0) & (after < len(self))
         if inside.any():
-            inside[inside] = steps[after[inside] - 1] <= 3.0 * np.median(steps)
+            inside[inside] = intervals[after[inside] - 1] <= LARGEST_GAP * np.median(intervals)
         stamps = stamp_ns[inside]
-
-        def between(array: Floats, turns: bool = False) -> Floats:
-            continuous = np.unwrap(array, axis=0) if turns else array
-            # From a stamp near by: nanoseconds since 1970 do not fit a double.
-            times, wanted = self.stamp_ns - self.stamp_ns[0], stamps - self.stamp_ns[0]
-            return np.column_stack([np.interp(wanted, times, column) for column in continuous.T])
-
-        return JointSeries(
-            self.topic, stamps, self.received_ns[after[inside]], self.names,
-            between(self.position, turns=True), between(self.velocity), between(self.effort))
+        # Relative to the first stamp: nanoseconds since 1970 exceed the precision of a double.
+        known, wanted = self.stamp_ns - self.stamp_ns[0], stamps - self.stamp_ns[0]
+        position, velocity, effort = (
+            np.column_stack([np.interp(wanted, known, column) for column in array.T])
+            for array in (np.unwrap(self.position, axis=0), self.velocity, self.effort))
+        return JointSeries(self.topic, stamps, self.received_ns[after[inside]], self.names,
+                           position, velocity, effort)
 
     def select(self, names: Sequence[str]) -> JointSeries:
-        """Return these columns in this order, NaN for a name that never occurs."""
-        def columns(array: Floats) -> Floats:
-            padded = np.column_stack([array, np.full(len(self), np.nan)])
-            return padded[:, [self.names.index(name) if name in self.names else -1
-                              for name in names]]
-
-        return JointSeries(
-            self.topic, self.stamp_ns, self.received_ns, tuple(names),
-            columns(self.position), columns(self.velocity), columns(self.effort))
+        """Return these columns in this order; a name that never occurs gives NaN."""
+        columns = [self.names.index(name) if name in self.names else -1 for name in names]
+        missing = np.full(len(self), np.nan)
+        arrays = (np.column_stack([array, missing])[:, columns]
+                  for array in (self.position, self.velocity, self.effort))
+        return JointSeries(self.topic, self.stamp_ns, self.received_ns, tuple(names), *arrays)
 
 
 @dataclass(frozen=True)
-class Status:
-    """One message of a DiagnosticStatus topic."""
-
-    received_ns: int
-    message: str
-    values: Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class Recording:
+class Bag:
     """
-    The JointState and DiagnosticStatus topics of one bag.
+    The JointState and DiagnosticStatus messages of a bag.
 
     :param path: the directory.
-    :param namespace: of the suite in the bag; None: found by the names of the topics.
-    :param started_ns: recorder time of the first message, since 1970.
-    :param duration_s: recorder time from the first message to the last.
+    :param namespace: of the suite in the bag; None: found from the topic names.
+    :param started_ns: recorder time of the first message [ns since 1970].
+    :param duration_s: recorder time from the first message to the last [s].
     :param message_count: of all topics and types.
-    :param topics: type by absolute name.
-    :param counts: number of messages by absolute name.
+    :param topics: message type by absolute topic name.
+    :param counts: number of messages by absolute topic name.
+    :param messages: recorder time [ns] and message, by absolute topic name.
     """
 
     path: Path
@@ -135,140 +127,103 @@ class Recording:
     message_count: int
     topics: Mapping[str, str]
     counts: Mapping[str, int]
-    _messages: Mapping[str, list[tuple[int, Any]]]
+    messages: Mapping[str, list[tuple[int, Any]]]
 
     @cached_property
     def _series(self) -> dict[str, JointSeries]:
         return {}
 
     def has(self, name: str) -> bool:
-        """Tell whether :meth:`joint_states` or :meth:`statuses` would find messages."""
+        """
+        Return whether the bag has messages of a topic, of any type.
+
+        :raises BagError: the topic exists in more than one namespace.
+        """
         try:
-            return bool(self._messages[self._resolve(name)])
+            return bool(self.messages[self._resolve(name)])
         except BagError as error:
-            if isinstance(error, _AmbiguousTopicError):
+            if error.values['reason'] == 'ambiguous':
                 raise
             return False
 
     def arrivals(self, name: str) -> JointSeries:
         """
-        Return a JointState topic as it was received.
+        Return a JointState topic in order of reception.
 
         :param name: relative, such as ``estimate/link_states``.
-        :raises BagError: no such topic, more than one, of another type, or no message on it.
+        :raises BagError: no such topic, more than one, another type, or no message.
         """
         topic = self._checked(name, JOINT_STATE)
         if topic not in self._series:
-            self._series[topic] = _joint_series(topic, self._messages[topic])
+            self._series[topic] = _joint_series(topic, self.messages[topic])
         return self._series[topic]
 
     def joint_states(self, name: str) -> JointSeries:
-        """Return :meth:`arrivals` in order of stamps, each stamp once."""
+        """Return a JointState topic in order of stamps, each stamp once; see `arrivals`."""
         return self.arrivals(name).by_stamp()
 
-    def statuses(self, name: str) -> list[Status]:
+    def statuses(self, name: str) -> list[dict[str, str]]:
         """
-        Return a DiagnosticStatus topic as it was received.
+        Return the values by key of each message of a DiagnosticStatus topic.
 
         :raises BagError: as :meth:`arrivals`.
         """
-        return [
-            Status(received_ns, message.message, {v.key: v.value for v in message.values})
-            for received_ns, message in self._messages[self._checked(name, DIAGNOSTIC_STATUS)]]
+        return [{item.key: item.value for item in message.values}
+                for _, message in self.messages[self._checked(name, DIAGNOSTIC_STATUS)]]
+
+    def last_status(self, name: str, key: str) -> str:
+        """Return the last value of a key that is not empty, '' without topic or value."""
+        values = self.statuses(name) if self.has(name) else []
+        return next((value for status in reversed(values) if (value := status.get(key))), '')
 
     def _checked(self, name: str, type_name: str) -> str:
         topic = self._resolve(name)
         if self.topics[topic] != type_name:
-            raise BagError(f'{self.path}: {topic} is {self.topics[topic]}, not {type_name}')
-        if not self._messages[topic]:
-            raise BagError(f'{self.path}: no message on {topic}')
+            raise bag_error(self.path, 'type', f': {topic} is {self.topics[topic]}, not '
+                            f'{type_name}', topic=topic, value=self.topics[topic])
+        if not self.messages[topic]:
+            raise bag_error(self.path, 'no_message', f': no message on {topic}', topic=topic)
         return topic
 
     def _resolve(self, name: str) -> str:
         if self.namespace is not None:
-            topic = '/'.join(['', *filter(None, f'{self.namespace}/{name}'.split('/'))])
-            found = [topic] if topic in self.topics else []
+            topic = absolute_name(self.namespace, name)
+            matches = [topic] if topic in self.topics else []
         else:
             longer = tuple(f'/{other}' for other in _LONGER_NAMES if other.endswith(f'/{name}'))
-            found = [topic for topic in self.topics
-                     if topic.endswith(f'/{name}') and not (longer and topic.endswith(longer))]
-        if not found:
-            raise BagError(f'{self.path}: no topic {name}')
-        if len(found) > 1:
-            raise _AmbiguousTopicError(
-                f'{self.path}: {name} could be {" or ".join(sorted(found))}: name the namespace')
-        return found[0]
-
-
-class _AmbiguousTopicError(BagError):
-    pass
+            matches = [topic for topic in self.topics
+                       if topic.endswith(f'/{name}') and not (longer and topic.endswith(longer))]
+        if not matches:
+            raise bag_error(self.path, 'no_topic', f': no topic {name}', topic=name)
+        if len(matches) > 1:
+            raise bag_error(
+                self.path, 'ambiguous', f': {name} could be {" or ".join(sorted(matches))}: name '
+                'the namespace', topic=name, value=sorted(matches))
+        return matches[0]
 
 
 def read_bag(path: str | Path, namespace: str | None = None,
-             progress: Callable[[Iterable[Any], int], Iterable[Any]] | None = None) -> Recording:
+             progress: Progress = no_progress) -> Bag:
     """
     Read a rosbag2 directory.
 
-    :param namespace: read the suite under this namespace, where the bag holds more than one.
-    :param progress: wraps the iterable of messages, given also how many there are.
-    :raises BagError: missing, no bag, not closed by its recorder, cut, or damaged.
+    :param namespace: of the suite, for a bag with more than one.
+    :param progress: wraps the iterable of messages.
+    :raises BagError: missing, no bag, not closed by its recorder, truncated or damaged.
     """
     path = Path(path)
     check_directory(path)
-    try:
-        return _read(path, namespace, progress)
-    except BagError:
-        raise
-    except Exception as error:  # a damaged file can break any layer below: YAML, MCAP, CDR
-        reason = ' '.join(str(error).split()) or type(error).__name__
-        raise BagError(f'{path} is cut or damaged: {reason}') from error
-
-
-def check_directory(path: Path) -> None:
-    """
-    Refuse what is no rosbag2 directory.
-
-    :raises BagError: missing, a file, or without metadata.
-    """
-    if not path.exists():
-        raise BagError(f'{path}: no such directory')
-    if not path.is_dir():
-        raise BagError(f'{path} is a file: name the rosbag2 directory that holds it')
-    if (path / 'metadata.yaml').is_file():
-        return
-    for suffix, storage in (('mcap', 'mcap'), ('db3', 'sqlite3')):
-        if any(path.glob(f'*.{suffix}')):
-            raise BagError(f'{path} has no metadata.yaml, its recorder was killed: repair it with '
-                           f'`ros2 bag reindex -s {storage} {path}`')
-    raise BagError(f'{path} is not a rosbag2 directory: it has no metadata.yaml')
-
-
-def _read(path: Path, namespace: str | None, progress: Any) -> Recording:
-    from rosbags.rosbag2 import Reader
-    from rosbags.typesys import get_typestore, Stores
-
-    deserialize = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
-    messages: dict[str, list[tuple[int, Any]]] = {}
-    with Reader(path) as reader:
-        topics = {connection.topic: connection.msgtype for connection in reader.connections}
-        chosen = [connection for connection in reader.connections
-                  if connection.msgtype in (JOINT_STATE, DIAGNOSTIC_STATUS)]
-        messages = {topic: [] for topic in topics}
-        counts = dict.fromkeys(topics, 0)
-        for connection in reader.connections:
-            counts[connection.topic] += connection.msgcount
-        expected = sum(connection.msgcount for connection in chosen)
-        stream: Iterable[Any] = reader.messages(chosen) if chosen else ()
-        for connection, received_ns, data in progress(stream, expected) if progress else stream:
+    with open_bag(path) as reader:
+        messages: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in reader.topics}
+        selected = [connection for connection in reader.connections
+                    if connection.msgtype in (JOINT_STATE, DIAGNOSTIC_STATUS)]
+        for connection, received_ns, data in reader.messages(selected, progress):
             messages[connection.topic].append(
-                (received_ns, deserialize(data, connection.msgtype)))
-        found = sum(map(len, messages.values()))
-        if found < expected:
-            raise BagError(f'{path} is cut: {found} of {expected} messages are left')
-        empty = reader.message_count == 0
-        return Recording(
-            path, namespace, 0 if empty else reader.start_time, reader.duration * 1e-9,
-            reader.message_count, topics, counts, messages)
+                (received_ns, reader.deserialize(connection, data)))
+        info = reader.info
+        return Bag(path, namespace, info.start_time if info.message_count else 0,
+                   info.duration * 1e-9, info.message_count, reader.topics,
+                   {topic: reader.count(topic) for topic in reader.topics}, messages)
 
 
 def _joint_series(topic: str, messages: list[tuple[int, Any]]) -> JointSeries:
@@ -277,8 +232,9 @@ def _joint_series(topic: str, messages: list[tuple[int, Any]]) -> JointSeries:
     arrays = np.full((3, len(messages), len(names)), np.nan)
     for row, (_, message) in enumerate(messages):
         columns = [column[name] for name in message.name]
-        for array, values in zip(arrays, (message.position, message.velocity, message.effort)):
-            # An array of another length belongs to a message that every node refuses.
+        for array, field in zip(arrays, _FIELDS):
+            values = getattr(message, field)
+            # Every node rejects a message with an array of another length.
             if len(values) == len(columns):
                 array[row, columns] = values
     stamps = [message.header.stamp for _, message in messages]

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a recording says about one setpoint: tracking, estimate, wheels, energy, loop timing.
+Metrics of one manoeuvre in a bag: tracking, estimate, wheels, energy, loop timing.
 
-All samples count by their stamps; see :mod:`fourbar_ros.analysis.manoeuvre` for which.
+Samples are selected by their stamps; :mod:`fourbar_ros.analysis.manoeuvre` defines which.
 """
 
 from __future__ import annotations
@@ -13,109 +13,124 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 import warnings
 
-from fourbar_ros.analysis.bags import BagError, Floats, JointSeries, Nanoseconds, Recording
-from fourbar_ros.analysis.manoeuvre import find_motion, Motion, pair, Paired
+from fourbar_ros.analysis.bag_reader import bag_error, BagError
+from fourbar_ros.analysis.bags import Bag, Floats, Nanoseconds
+from fourbar_ros.analysis.manoeuvre import (
+    find_manoeuvre,
+    Manoeuvre,
+    match_stamps,
+    MatchedSeries,
+)
 from fourbar_ros.common import names
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.angles import wrap_angles
 import numpy as np
 
 INDEPENDENT_LINKS = LINK_NAMES[:2]
+# Averaging time of the final error [s].
 FINAL_WINDOW_S = 1.0
 
 
-class Meaning(NamedTuple):
-    """What a metric measures; the unit is at the end of its name."""
+class MetricDescription(NamedTuple):
+    """
+    Description of a metric.
+
+    :param unit: also the suffix of the name.
+    :param meaning: one sentence.
+    """
 
     unit: str
-    sentence: str
+    meaning: str
 
 
-MEANINGS = {
-    'tracking.rms_rad': Meaning(
-        'rad', 'Ground truth minus reference of links a and b, from the setpoint to the end of '
-        'the step, root mean square over all samples of both.'),
-    'tracking.peak_rad': Meaning('rad', 'The largest of the same differences.'),
-    'tracking.final_error_rad': Meaning(
+METRICS = {
+    'tracking.rms_rad': MetricDescription(
+        'rad', 'Ground truth minus reference of links a and b, root mean square over all samples '
+        'of both from the setpoint to the end of the step.'),
+    'tracking.peak_rad': MetricDescription(
+        'rad', 'Largest absolute value of the difference in tracking.rms_rad.'),
+    'tracking.final_error_rad': MetricDescription(
         'rad', 'Ground truth minus goal, averaged over the last second at the goal; the larger '
         'of links a and b.'),
-    'tracking.estimated_rms_rad': Meaning(
-        'rad', 'As tracking.rms_rad with the estimate for the truth: all that hardware can know.'),
-    'tracking.estimated_peak_rad': Meaning('rad', 'The largest of the same differences.'),
-    'tracking.estimated_final_error_rad': Meaning(
-        'rad', 'As tracking.final_error_rad with the estimate for the truth.'),
-    'estimate.rms_error_rad': Meaning(
+    'tracking.estimated_rms_rad': MetricDescription(
+        'rad', 'As tracking.rms_rad with the estimate in place of ground truth, as available on '
+        'hardware.'),
+    'tracking.estimated_peak_rad': MetricDescription(
+        'rad', 'Largest absolute value of the difference in tracking.estimated_rms_rad.'),
+    'tracking.estimated_final_error_rad': MetricDescription(
+        'rad', 'As tracking.final_error_rad with the estimate in place of ground truth.'),
+    'estimate.rms_error_rad': MetricDescription(
         'rad', 'Estimate minus ground truth of the angles of all four links, root mean square '
         'since the setpoint.'),
-    'estimate.peak_error_rad': Meaning('rad', 'The largest of the same differences.'),
-    'estimate.within_2_sigma': Meaning(
-        '1', 'Share of these differences within two standard deviations as the filter states '
-        'them; 0.95 if it knows its own accuracy.'),
-    'estimate.mean_nis_per_degree_of_freedom': Meaning(
+    'estimate.peak_error_rad': MetricDescription(
+        'rad', 'Largest absolute value of the difference in estimate.rms_error_rad.'),
+    'estimate.within_2_sigma': MetricDescription(
+        '1', "Share of estimate errors within two standard deviations of the filter's "
+        'covariance; 0.95 for a consistent filter.'),
+    'estimate.mean_nis_per_degree_of_freedom': MetricDescription(
         '1', 'Normalized innovation squared over its degrees of freedom, mean since the '
         'setpoint; 1 for a consistent filter.'),
-    'flywheel.peak_speed_rad_s': Meaning(
+    'flywheel.peak_speed_rad_s': MetricDescription(
         'rad/s', 'Largest wheel speed relative to its link, ground truth.'),
-    'flywheel.measured_peak_speed_rad_s': Meaning(
-        'rad/s', 'The same as the wheel encoders saw it.'),
-    'flywheel.peak_torque_n_m': Meaning('N m', 'Largest motor torque that was applied.'),
-    'flywheel.peak_energy_j': Meaning(
-        'J', 'Paper eq. 7, the sum of If/2 times absolute wheel speed squared: its peak, ground '
-        'truth.'),
-    'flywheel.final_energy_j': Meaning('J', 'The same at the end.'),
-    'energy.peak_flywheel_energy_j': Meaning(
-        'J', 'Peak of eq. 7 as the controller estimates it.'),
-    'energy.eq9_j_s': Meaning(
+    'flywheel.measured_peak_speed_rad_s': MetricDescription(
+        'rad/s', 'Largest wheel speed relative to its link, as measured by the wheel encoders.'),
+    'flywheel.peak_torque_n_m': MetricDescription('N m', 'Largest applied motor torque.'),
+    'flywheel.peak_energy_j': MetricDescription(
+        'J', 'Paper eq. 7, sum of If/2 times absolute wheel speed squared: peak, ground truth.'),
+    'flywheel.final_energy_j': MetricDescription(
+        'J', 'Paper eq. 7 at the end, ground truth.'),
+    'energy.peak_flywheel_energy_j': MetricDescription(
+        'J', "Paper eq. 7: peak of the controller's estimate."),
+    'energy.eq9_j_s': MetricDescription(
         'J s', 'Paper eq. 9, accumulated by the controller since the setpoint.'),
-    'energy.work_j': Meaning(
+    'energy.work_j': MetricDescription(
         'J', 'Mechanical work of the motors, the integral of |torque times relative speed|, '
         'accumulated since the setpoint.'),
-    'energy.copper_loss_j': Meaning(
-        'J', 'Heat in the windings of the motors, the integral of resistance times current '
-        'squared as the controller works it out, accumulated since the setpoint; 0 for motors '
-        'whose windings are not described.'),
-    'loop.rate_hz': Meaning('Hz', 'Ticks per second of stamp time since the setpoint.'),
-    'loop.ticks': Meaning('1', 'Ticks since the setpoint.'),
-    'loop.round_trip_p50_ms': Meaning(
-        'ms', 'From a tick to the command that answers it, at the device, median.'),
-    'loop.round_trip_p99_ms': Meaning('ms', 'The same, 99th percentile.'),
-    'loop.round_trip_max_ms': Meaning('ms', 'The same, worst.'),
-    'loop.lost': Meaning('1', 'Ticks that no command answered within one control period.'),
-    'loop.unrecorded_ticks': Meaning(
-        '1', 'Ticks that the stamps show to be missing in the recording.'),
+    'energy.copper_loss_j': MetricDescription(
+        'J', 'Heat in the motor windings, the integral of resistance times current squared as '
+        'estimated by the controller, accumulated since the setpoint; 0 for motors without '
+        'winding data.'),
+    'loop.rate_hz': MetricDescription(
+        'Hz', 'Ticks per second of stamp time since the setpoint.'),
+    'loop.ticks': MetricDescription('1', 'Ticks since the setpoint.'),
+    'loop.round_trip_p50_ms': MetricDescription(
+        'ms', 'Time from a tick to the command that answers it, at the device, median.'),
+    'loop.round_trip_p99_ms': MetricDescription('ms', 'Round trip, 99th percentile.'),
+    'loop.round_trip_max_ms': MetricDescription('ms', 'Round trip, largest.'),
+    'loop.lost': MetricDescription(
+        '1', 'Ticks without an answering command within one control period.'),
+    'loop.unrecorded_ticks': MetricDescription(
+        '1', 'Ticks missing in the bag, from gaps between stamps.'),
 }
 
 
-def metrics(recording: Recording, mechanism: Mechanism | None = None) -> dict[str, Any]:
+def compute_metrics(bag: Bag, mechanism: Mechanism | None = None) -> dict[str, Any]:
     """
-    Return every number that the recording supports, nested, ready for JSON.
+    Return every metric that the bag supports, nested, for JSON.
 
-    :param mechanism: for the flywheel energy of paper eq. 7.
-    :returns: `motion`, the groups of MEANINGS, and `missing`: name to reason.
-    :raises BagError: an essential topic is missing or no setpoint was followed.
+    :param mechanism: required for the flywheel energy of paper eq. 7.
+    :returns: `motion`, the groups of `METRICS`, and `missing`: reason by name.
+    :raises BagError: an essential topic is missing, or no setpoint was followed.
     """
-    motion = find_motion(recording)
-    found: dict[str, float] = {}
+    manoeuvre = find_manoeuvre(bag)
+    values: dict[str, float] = {}
     missing: dict[str, str] = {}
-    for keys, measure in _measurements(recording, motion, mechanism):
+    for keys, measure in _measurements(manoeuvre, mechanism):
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter('ignore', RuntimeWarning)  # nanmax of nothing but NaN
-                values = dict(zip(keys, measure()))
+                warnings.simplefilter('ignore', RuntimeWarning)  # nanmax of NaN only
+                values.update(zip(keys, measure()))
         except BagError as error:
             missing.update(dict.fromkeys(keys, str(error)))
-            continue
-        for name, value in values.items():
-            if np.isfinite(value):
-                found[name] = value
-            else:
-                missing[name] = f'{recording.path}: the messages leave it out'
-    result: dict[str, Any] = {'motion': _describe(motion)}
-    for name in MEANINGS:
+    for name in [name for name, value in values.items() if not np.isfinite(value)]:
+        del values[name]
+        missing[name] = f'{bag.path}: the messages lack this value'
+    result: dict[str, Any] = {'motion': _describe(manoeuvre)}
+    for name in METRICS:
         group, _, key = name.partition('.')
         result.setdefault(group, {})
-        if name in found:
-            result[group][key] = found[name]
+        if name in values:
+            result[group][key] = values[name]
     result['missing'] = missing
     return result
 
@@ -123,83 +138,63 @@ def metrics(recording: Recording, mechanism: Mechanism | None = None) -> dict[st
 _Measurement = tuple[tuple[str, ...], Callable[[], tuple[float, ...]]]
 
 
-def _measurements(recording: Recording, motion: Motion,
-                  mechanism: Mechanism | None) -> list[_Measurement]:
-    truth, estimate = names.SIM_LINK_STATES, names.ESTIMATE_LINK_STATES
+def _measurements(of: Manoeuvre, mechanism: Mechanism | None) -> list[_Measurement]:
+    """Return the names of metrics with the functions that measure them."""
     return [
-        (('tracking.rms_rad', 'tracking.peak_rad'),
-         lambda: _tracking(recording, motion, truth)),
-        (('tracking.final_error_rad',), lambda: _final_error(recording, motion, truth)),
+        (('tracking.rms_rad', 'tracking.peak_rad'), lambda: _tracking(of, names.SIM_LINK_STATES)),
+        (('tracking.final_error_rad',), lambda: _final_error(of, names.SIM_LINK_STATES)),
         (('tracking.estimated_rms_rad', 'tracking.estimated_peak_rad'),
-         lambda: _tracking(recording, motion, estimate)),
+         lambda: _tracking(of, names.ESTIMATE_LINK_STATES)),
         (('tracking.estimated_final_error_rad',),
-         lambda: _final_error(recording, motion, estimate)),
+         lambda: _final_error(of, names.ESTIMATE_LINK_STATES)),
         (('estimate.rms_error_rad', 'estimate.peak_error_rad'),
-         lambda: _rms_and_peak(estimate_error(recording, motion).difference)),
-        (('estimate.within_2_sigma',), lambda: _within_2_sigma(recording, motion)),
-        (('estimate.mean_nis_per_degree_of_freedom',), lambda: _mean_nis(recording, motion)),
+         lambda: _rms_and_peak(_estimate_error(of).difference)),
+        (('estimate.within_2_sigma',), lambda: _within_2_sigma(of)),
+        (('estimate.mean_nis_per_degree_of_freedom',), lambda: _mean_nis(of)),
         (('flywheel.peak_speed_rad_s',),
-         lambda: _peak_speed(recording, motion, names.SIM_FLYWHEEL_STATES)),
+         lambda: _peak(of.series(names.SIM_FLYWHEEL_STATES).velocity)),
         (('flywheel.measured_peak_speed_rad_s',),
-         lambda: _peak_speed(recording, motion, names.FLYWHEEL_STATES)),
-        (('flywheel.peak_torque_n_m',), lambda: _peak_torque(recording, motion)),
+         lambda: _peak(of.series(names.FLYWHEEL_STATES).velocity)),
+        (('flywheel.peak_torque_n_m',), lambda: _peak(of.series(names.FLYWHEEL_STATES).effort)),
         (('flywheel.peak_energy_j', 'flywheel.final_energy_j'),
-         lambda: _peak_and_last(flywheel_energy(recording, motion, mechanism)[1])),
+         lambda: _peak_and_last(flywheel_energy(of, mechanism)[1])),
         (('energy.peak_flywheel_energy_j', 'energy.eq9_j_s', 'energy.work_j',
-          'energy.copper_loss_j'), lambda: _energy(recording, motion)),
-        (('loop.ticks', 'loop.rate_hz', 'loop.unrecorded_ticks'),
-         lambda: _ticks(recording, motion)),
+          'energy.copper_loss_j'), lambda: _energy(of)),
+        (('loop.ticks', 'loop.rate_hz', 'loop.unrecorded_ticks'), lambda: _ticks(of)),
         (('loop.round_trip_p50_ms', 'loop.round_trip_p99_ms', 'loop.round_trip_max_ms'),
-         lambda: _round_trip(recording, motion)),
-        (('loop.lost',), lambda: _lost(recording, motion)),
+         lambda: _round_trip(of)),
+        (('loop.lost',), lambda: _lost(of)),
     ]
 
 
-def estimate_error(recording: Recording, motion: Motion) -> Paired:
+def flywheel_energy(manoeuvre: Manoeuvre, mechanism: Mechanism | None
+                    ) -> tuple[Nanoseconds, Floats]:
     """
-    Pair estimate and ground truth of all four links since the setpoint.
+    Return stamps [ns] and energy of the wheels, paper eq. 7, from ground truth [J].
 
-    :raises BagError: one of the two is not in the recording.
-    """
-    return pair(_within(recording, motion, names.ESTIMATE_LINK_STATES),
-                _within(recording, motion, names.SIM_LINK_STATES), LINK_NAMES)
-
-
-def flywheel_energy(recording: Recording, motion: Motion,
-                    mechanism: Mechanism | None) -> tuple[Nanoseconds, Floats]:
-    """
-    Return stamps [ns] and the energy of the wheels there, paper eq. 7, from ground truth [J].
-
-    :raises BagError: no ground truth in the recording, or no mechanism given.
+    :raises BagError: the bag has no ground truth, or no mechanism is given.
     """
     if mechanism is None:
-        raise BagError(f'the mechanism of {recording.path} is unknown: give --mechanism')
-    links = _within(recording, motion, names.SIM_LINK_STATES).select(LINK_NAMES)
-    wheels = _within(recording, motion, names.SIM_FLYWHEEL_STATES).select(FLYWHEEL_NAMES)
-    both = pair(links, wheels, LINK_NAMES)
-    relative = wheels.rows(np.isin(wheels.stamp_ns, both.stamp_ns)).velocity
-    absolute = both.left.velocity + relative
-    return both.stamp_ns, 0.5 * np.sum(mechanism.flywheel_inertias * absolute ** 2, axis=1)
+        raise bag_error(manoeuvre.bag.path, 'no_data',
+                        ': its mechanism is unknown, give --mechanism')
+    links = manoeuvre.series(names.SIM_LINK_STATES).select(LINK_NAMES)
+    wheels = manoeuvre.series(names.SIM_FLYWHEEL_STATES).select(FLYWHEEL_NAMES)
+    matched = match_stamps(links, wheels, LINK_NAMES)
+    relative = wheels.rows(np.isin(wheels.stamp_ns, matched.stamp_ns)).velocity
+    absolute = matched.left.velocity + relative
+    return matched.stamp_ns, 0.5 * np.sum(mechanism.flywheel_inertias * absolute ** 2, axis=1)
 
 
-def _within(recording: Recording, motion: Motion, name: str,
-            end_ns: int | None = None) -> JointSeries:
-    series = recording.joint_states(name).between(motion.start_ns, end_ns or motion.end_ns)
-    if not len(series):
-        raise BagError(f'{recording.path}: no message on {series.topic} since the setpoint')
-    return series
-
-
-def _describe(motion: Motion) -> dict[str, Any]:
+def _describe(manoeuvre: Manoeuvre) -> dict[str, Any]:
     return {
-        'setpoint_number': motion.setpoint_number,
-        'setpoint_count': motion.setpoint_count,
-        'start_stamp_ns': motion.start_ns,
-        'setpoint_duration_s': (motion.step_end_ns - motion.start_ns) * 1e-9,
-        'duration_s': (motion.end_ns - motion.start_ns) * 1e-9,
-        'complete': motion.complete,
-        'initial_rad': _by_link(motion.initial),
-        'goal_rad': _by_link(motion.goal),
+        'setpoint_number': manoeuvre.setpoint_number,
+        'setpoint_count': manoeuvre.setpoint_count,
+        'start_stamp_ns': manoeuvre.start_ns,
+        'setpoint_duration_s': (manoeuvre.step_end_ns - manoeuvre.start_ns) * 1e-9,
+        'duration_s': (manoeuvre.end_ns - manoeuvre.start_ns) * 1e-9,
+        'complete': manoeuvre.complete,
+        'initial_rad': _by_link(manoeuvre.initial),
+        'goal_rad': _by_link(manoeuvre.goal),
     }
 
 
@@ -207,83 +202,88 @@ def _by_link(angles: Floats) -> dict[str, float]:
     return {name: float(angle) for name, angle in zip(LINK_NAMES, angles) if np.isfinite(angle)}
 
 
-def _tracking(recording: Recording, motion: Motion, actual: str) -> tuple[float, ...]:
-    end_ns = min(motion.step_end_ns, motion.end_ns)
-    return _rms_and_peak(pair(
-        _within(recording, motion, actual, end_ns),
-        _within(recording, motion, names.REFERENCE, end_ns), INDEPENDENT_LINKS).difference)
+def _estimate_error(manoeuvre: Manoeuvre) -> MatchedSeries:
+    return match_stamps(manoeuvre.series(names.ESTIMATE_LINK_STATES),
+                        manoeuvre.series(names.SIM_LINK_STATES), LINK_NAMES)
 
 
-def _final_error(recording: Recording, motion: Motion, actual: str) -> tuple[float, ...]:
-    if not motion.complete:
-        raise BagError(f'{recording.path} ends before the step does')
-    begin_ns = max(motion.step_end_ns, motion.end_ns - round(FINAL_WINDOW_S * 1e9))
-    last = _within(recording, motion, actual).between(begin_ns, motion.end_ns)
-    error = wrap_angles(last.select(INDEPENDENT_LINKS).position - motion.goal[:2])
+def _tracking(manoeuvre: Manoeuvre, actual: str) -> tuple[float, ...]:
+    end_ns = min(manoeuvre.step_end_ns, manoeuvre.end_ns)
+    return _rms_and_peak(match_stamps(
+        manoeuvre.series(actual, end_ns), manoeuvre.series(names.REFERENCE, end_ns),
+        INDEPENDENT_LINKS).difference)
+
+
+def _final_error(manoeuvre: Manoeuvre, actual: str) -> tuple[float, ...]:
+    if not manoeuvre.complete:
+        raise bag_error(manoeuvre.bag.path, 'no_data', ' ends before the step does')
+    begin_ns = max(manoeuvre.step_end_ns, manoeuvre.end_ns - round(FINAL_WINDOW_S * 1e9))
+    last = manoeuvre.series(actual).between(begin_ns, manoeuvre.end_ns)
+    error = wrap_angles(last.select(INDEPENDENT_LINKS).position - manoeuvre.goal[:2])
     return (float(np.max(np.abs(np.nanmean(error, axis=0)))),)
 
 
-def _within_2_sigma(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    error = estimate_error(recording, motion)
-    both = pair(error.left, recording.joint_states(names.ESTIMATE_SIGMA), LINK_NAMES)
-    known = np.isin(error.stamp_ns, both.stamp_ns)
-    return (float(np.mean(np.abs(error.difference[known]) <= 2.0 * both.right.position)),)
+def _within_2_sigma(manoeuvre: Manoeuvre) -> tuple[float, ...]:
+    error = _estimate_error(manoeuvre)
+    sigma = match_stamps(error.left, manoeuvre.bag.joint_states(names.ESTIMATE_SIGMA), LINK_NAMES)
+    matched = np.isin(error.stamp_ns, sigma.stamp_ns)
+    return (float(np.mean(np.abs(error.difference[matched]) <= 2.0 * sigma.right.position)),)
 
 
-def _mean_nis(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    # As received: one tick may bring several measurements, all with the stamp of the tick.
-    innovation = recording.arrivals(names.ESTIMATE_INNOVATION).between(
-        motion.start_ns, motion.end_ns).select(('nis', 'degrees_of_freedom')).position
+def _mean_nis(manoeuvre: Manoeuvre) -> tuple[float, ...]:
+    # In order of reception: several measurements of one tick carry the same stamp.
+    innovation = manoeuvre.bag.arrivals(names.ESTIMATE_INNOVATION).between(
+        manoeuvre.start_ns, manoeuvre.end_ns).select(('nis', 'degrees_of_freedom')).position
     nis, degrees = np.nansum(innovation, axis=0)
     if not degrees > 0:
-        raise BagError(f'{recording.path}: no innovation since the setpoint')
+        raise bag_error(manoeuvre.bag.path, 'no_data', ': no innovation since the setpoint',
+                        topic=names.ESTIMATE_INNOVATION)
     return (float(nis / degrees),)
 
 
-def _peak_speed(recording: Recording, motion: Motion, name: str) -> tuple[float, ...]:
-    return (float(np.nanmax(np.abs(_within(recording, motion, name).velocity))),)
-
-
-def _peak_torque(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    return (float(np.nanmax(np.abs(_within(recording, motion, names.FLYWHEEL_STATES).effort))),)
-
-
-def _energy(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    energy, eq9, work, copper = _within(recording, motion, names.ENERGY).select(
+def _energy(manoeuvre: Manoeuvre) -> tuple[float, ...]:
+    energy, eq9, work, copper = manoeuvre.series(names.ENERGY).select(
         ('flywheel_energy_j', 'eq9_j_s', 'work_j', 'copper_loss_j')).position.T
-    # Recordings from before it was told have none.
-    told = np.isfinite(copper).any()
+    # Older bags have no copper loss.
+    known = np.isfinite(copper).any()
     return (float(np.nanmax(energy)), _growth(eq9), _growth(work),
-            _growth(copper) if told else np.nan)
+            _growth(copper) if known else np.nan)
 
 
-def _ticks(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    stamps = _within(recording, motion, names.TIMING).stamp_ns
+def _ticks(manoeuvre: Manoeuvre) -> tuple[float, ...]:
+    stamps = manoeuvre.series(names.TIMING).stamp_ns
     periods = np.diff(stamps)
     if not len(periods):
-        raise BagError(f'{recording.path}: a single tick since the setpoint')
+        raise bag_error(manoeuvre.bag.path, 'no_data', ': a single tick since the setpoint',
+                        topic=names.TIMING)
     skipped = np.sum(np.round(periods / np.median(periods)) - 1)
     return len(stamps), float(len(periods) / (periods.sum() * 1e-9)), int(skipped)
 
 
-def _round_trip(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    trips = _within(recording, motion, names.TIMING).select(('round_trip_s',)).position * 1e3
-    if np.all(np.isnan(trips)):
-        raise BagError(f'{recording.path}: no tick was answered since the setpoint')
-    p50, p99, worst = np.nanpercentile(trips, [50, 99, 100])
-    return float(p50), float(p99), float(worst)
+def _timing(manoeuvre: Manoeuvre, scalar: str) -> Floats:
+    values = manoeuvre.series(names.TIMING).select((scalar,)).position[:, 0]
+    if np.all(np.isnan(values)):
+        raise bag_error(manoeuvre.bag.path, 'no_data', f': timing has no {scalar} since the '
+                        'setpoint', topic=names.TIMING, name=scalar)
+    return values
 
 
-def _lost(recording: Recording, motion: Motion) -> tuple[float, ...]:
-    lost = _within(recording, motion, names.TIMING).select(('lost',)).position[:, 0]
-    if np.all(np.isnan(lost)):
-        raise BagError(f'{recording.path}: timing does not count lost ticks')
-    return (int(_growth(lost)),)
+def _round_trip(manoeuvre: Manoeuvre) -> tuple[float, ...]:
+    p50, p99, largest = np.nanpercentile(_timing(manoeuvre, 'round_trip_s') * 1e3, [50, 99, 100])
+    return float(p50), float(p99), float(largest)
+
+
+def _lost(manoeuvre: Manoeuvre) -> tuple[float, ...]:
+    return (int(_growth(_timing(manoeuvre, 'lost'))),)
 
 
 def _growth(total: Floats) -> float:
-    """Add up the increments: a sum that began before the setpoint, or anew at it, is the same."""
+    """Add up the increments, independent of where the sum began or was reset."""
     return float(np.sum(np.maximum(np.diff(total[np.isfinite(total)]), 0.0)))
+
+
+def _peak(values: Floats) -> tuple[float, ...]:
+    return (float(np.nanmax(np.abs(values))),)
 
 
 def _rms_and_peak(values: Floats) -> tuple[float, ...]:

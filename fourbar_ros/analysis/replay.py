@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The estimator over a recorded bag: a new bag with other estimates, and both sides by the numbers.
+Replay of the estimator over a bag: a new bag with the new estimates, and both sets of estimates.
 
-The messages go to the estimator in the order in which the bag has them, by the very door that the
-node has (:mod:`fourbar_ros.estimation.estimator_topics`).
+The estimator receives the messages in the order of the bag, through the same interface as in its
+node (:mod:`fourbar_ros.estimation.estimator_topics`).
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from fourbar_ros.analysis.bags import BagError, DIAGNOSTIC_STATUS, JOINT_STATE, JointSeries
-from fourbar_ros.analysis.stored_bag import copier, open_bag, StoredBag
-from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.common.names import (
-    DIAGNOSTICS,
-    ESTIMATE_INNOVATION,
-    ESTIMATE_LINK_STATES,
-    ESTIMATE_WAITING,
-    FLYWHEEL_COMMAND,
-    FLYWHEEL_STATES,
-    SIM_LINK_STATES,
+from fourbar_ros.analysis.bag_reader import (
+    absolute_name,
+    bag_error,
+    BagReader,
+    connection_copier,
+    DIAGNOSTIC_STATUS,
+    JOINT_STATE,
+    open_bag,
 )
-from fourbar_ros.common.progress import Progress
+from fourbar_ros.analysis.bags import JointSeries
+from fourbar_ros.common import names
+from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.progress import no_progress, Progress
+from fourbar_ros.common.settings import check_keys
 from fourbar_ros.estimation import EstimatorSettings
 from fourbar_ros.estimation.estimator_settings import PARAMETERS
 from fourbar_ros.estimation.estimator_topics import EstimatorTopics, INPUTS, OutputMessage, OUTPUTS
@@ -43,23 +44,24 @@ if TYPE_CHECKING:
 DIAGNOSTIC_ARRAY = 'diagnostic_msgs/msg/DiagnosticArray'
 HEADER = 'std_msgs/msg/Header'
 NODE = 'estimator'
-COUNTERS = ('rejected', 'gated')
+# Outputs of the recorded estimator, and ground truth.
+LOGGED = (names.ESTIMATE_LINK_STATES, names.ESTIMATE_INNOVATION, names.SIM_LINK_STATES)
+NIS_NAMES = ('nis', 'degrees_of_freedom')
 
 
 class ReplayError(FourbarError):
-    """A replay that cannot be made as it was asked for."""
+    """A replay that is not possible with these arguments; `values` hold `reason`."""
 
 
 @dataclass
-class Judgements:
+class EstimatorCounters:
     """
-    What an estimator said of the samples that it got.
+    Counters of an estimator over a replay.
 
-    :param starts: how often its filter was started.
-    :param rejected: messages of no use, by kind.
-    :param gated: samples that the gate refused, by sensor.
-    :param faults: seconds for which a sensor was said to have a fault, by `sensor: fault`; None
-        where only the fact is known.
+    :param starts: number of starts of the filter.
+    :param rejected: rejected messages by kind.
+    :param gated: samples outside the gate, by sensor.
+    :param faults: duration of each sensor fault by `sensor: fault` [s], None if unknown.
     """
 
     starts: int = 0
@@ -68,308 +70,282 @@ class Judgements:
     faults: dict[str, float | None] = field(default_factory=dict)
 
 
-class LinkLog:
-    """Collects angle and rate of the four links, and joins them to arrays."""
+class JointStateLog:
+    """Collects position and velocity of named values of JointState messages."""
 
-    def __init__(self) -> None:
+    def __init__(self, columns: Sequence[str]) -> None:
+        self._columns = tuple(columns)
         self._stamps, self._values = array('q'), array('d')
 
-    def add(self, stamp_ns: int, names: Sequence[str], position: Sequence[float],
-            velocity: Sequence[float]) -> None:
-        """Take a message; what it leaves out, or has at odd lengths, is NaN."""
+    def add(self, stamp_ns: int, joints: Sequence[str], position: Sequence[float],
+            velocity: Sequence[float] = ()) -> None:
+        """Add a message; a value that is missing, or in an array of wrong length, is NaN."""
         self._stamps.append(stamp_ns)
         for values in (position, velocity):
-            if len(values) != len(names):
-                self._values.extend([np.nan] * 4)
-            elif tuple(names) == LINK_NAMES:
-                self._values.extend(values)
-            else:
-                known = dict(zip(names, values))
-                self._values.extend(known.get(name, np.nan) for name in LINK_NAMES)
+            by_name = dict(zip(joints, values)) if len(values) == len(joints) else {}
+            self._values.extend(by_name.get(name, np.nan) for name in self._columns)
 
     def series(self, topic: str) -> JointSeries:
-        """Return what came in the order of stamps, each once."""
+        """Return the messages in order of arrival."""
         stamps = np.array(self._stamps, dtype=np.int64)
-        values = np.array(self._values).reshape(-1, 2, 4)
-        return JointSeries(topic, stamps, stamps, LINK_NAMES, values[:, 0], values[:, 1],
-                           np.full((len(stamps), 4), np.nan)).by_stamp()
-
-
-class NisLog:
-    """Collects the NIS of updates with their degrees of freedom."""
-
-    def __init__(self) -> None:
-        self._stamps, self._values = array('q'), array('d')
-
-    def add(self, stamp_ns: int, names: Sequence[str], position: Sequence[float]) -> None:
-        """Take a message of `estimate/innovation`."""
-        known = dict(zip(names, position))
-        self._stamps.append(stamp_ns)
-        self._values.extend(known.get(name, np.nan) for name in ('nis', 'degrees_of_freedom'))
-
-    def rows(self) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """Return stamp [ns], NIS and degrees of freedom of updates that used a sample, (n, 3)."""
-        rows = np.column_stack([
-            np.array(self._stamps, dtype=float), np.array(self._values).reshape(-1, 2)])
-        return rows[rows[:, 2] > 0]
+        values = np.array(self._values).reshape(-1, 2, len(self._columns))
+        return JointSeries(topic, stamps, stamps, self._columns, values[:, 0], values[:, 1],
+                           np.full((len(stamps), len(self._columns)), np.nan))
 
 
 @dataclass
-class Side:
+class EstimatorRecord:
     """
-    One of the two estimators.
+    Output of one of the two estimators.
 
-    :param states: what it published as `estimate/link_states`.
-    :param nis: what it published as `estimate/innovation`.
-    :param judgements: None where the bag does not tell.
+    :param states: its `estimate/link_states`.
+    :param innovations: NIS and degrees of freedom of its `estimate/innovation`.
+    :param counters: None if the bag has none.
     """
 
-    states: LinkLog = field(default_factory=LinkLog)
-    nis: NisLog = field(default_factory=NisLog)
-    judgements: Judgements | None = None
+    states: JointStateLog = field(default_factory=lambda: JointStateLog(LINK_NAMES))
+    innovations: JointStateLog = field(default_factory=lambda: JointStateLog(NIS_NAMES))
+    counters: EstimatorCounters | None = None
+
+    def nis(self) -> tuple[Any, Any, Any]:
+        """Return stamps [ns], NIS and degrees of freedom of updates with a sample, (n,) each."""
+        series = self.innovations.series(names.ESTIMATE_INNOVATION)
+        used = series.rows(series.position[:, 1] > 0)
+        return used.stamp_ns, used.position[:, 0], used.position[:, 1]
 
 
-@dataclass(frozen=True)
-class Replay:
+@dataclass
+class ReplayResult:
     """
-    What came of a replay.
+    Result of a replay.
 
-    :param bag: the recording.
-    :param namespace: of the suite in it, '' or as '/table1'.
+    :param bag: the replayed bag.
+    :param namespace: of the suite in the bag, '' or as '/table1'.
     :param mechanism: preset or path.
     :param settings: of the estimator, by name.
     :param ticks_ns: (n,) stamps of the ticks, each once [ns].
     :param waiting: number of ticks without an estimate.
-    :param recorded, replayed: the two sides.
+    :param recorded, replayed: output of the estimator in the bag, and in the replay.
     :param truth: `sim/link_states` of the bag.
-    :param warnings: what the new bag lacks.
+    :param warnings: data that the new bag lacks.
     """
 
     bag: Path
     namespace: str
     mechanism: str
     settings: Mapping[str, Any]
-    ticks_ns: list[int]
-    waiting: int
-    recorded: Side
-    replayed: Side
-    truth: LinkLog
-    warnings: list[str]
+    ticks_ns: list[int] = field(default_factory=list)
+    waiting: int = 0
+    recorded: EstimatorRecord = field(default_factory=EstimatorRecord)
+    replayed: EstimatorRecord = field(default_factory=EstimatorRecord)
+    truth: JointStateLog = field(default_factory=lambda: JointStateLog(LINK_NAMES))
+    warnings: list[str] = field(default_factory=list)
 
 
 def replay(bag: str | Path, output: Path, values: Mapping[str, Any], *,
-           namespace: str | None = None, progress: Progress | None = None) -> Replay:
+           namespace: str | None = None, progress: Progress = no_progress) -> ReplayResult:
     """
-    Run the estimator over a bag, and write a new one (MCAP).
+    Run the estimator over a bag, and write a new bag (MCAP).
 
-    It holds all that the old one does, with the estimates in place of those that were recorded,
-    at the log times of the ticks that they answer. After an error a part of it may be there.
+    The new bag has all messages of the old one, with the new estimates in place of the recorded
+    ones, at the log times of their ticks. After an error an incomplete new bag may exist.
 
-    :param bag: rosbag2 directory, or its single file.
-    :param output: directory to make.
-    :param values: some of the estimator's parameters by name; the others have their defaults,
-        `mechanism` that which the device names in the bag.
-    :param namespace: of the suite, for a bag that holds more than one.
-    :param progress: wraps the iterable of messages, given also how many there are.
-    :raises FourbarError: a bag that cannot be read or that lacks what the estimator needs, a
-        value that is refused, an unknown mechanism.
+    :param bag: rosbag2 directory, or its single storage file.
+    :param output: directory to create.
+    :param values: parameters of the estimator by name. Other parameters have their defaults,
+        `mechanism` the value of the device status in the bag.
+    :param namespace: of the suite, for a bag with more than one.
+    :param progress: wraps the iterable of messages.
+    :raises FourbarError: a bag that cannot be read or lacks an input of the estimator, a refused
+        value, an unknown mechanism.
     :raises OSError: the new bag cannot be written.
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
 
+    path = Path(bag)
     with ExitStack() as stack:
-        stored = stack.enter_context(open_bag(bag))
-        chosen = find_namespace(stored, namespace)
-        parameters = checked_values(values)
+        reader = stack.enter_context(open_bag(path))
+        selected = find_namespace(reader, namespace)
+        parameters = check_parameters(values)
         if 'mechanism' not in values:
-            parameters['mechanism'] = _recorded_mechanism(stored, chosen) or (
+            parameters['mechanism'] = _recorded_mechanism(reader, selected) or (
                 parameters['mechanism'])
         mechanism = parameters.pop('mechanism')
-        run = _Run(stored, chosen, EstimatorTopics(
-            load_mechanism(mechanism), EstimatorSettings(**parameters)))
-        writer = Writer(output, version=9, storage_plugin=StoragePlugin.MCAP)
-        run.write_to(stack.enter_context(writer), progress)
-        return Replay(Path(bag), chosen, mechanism, parameters, run.ticks_ns, run.waiting,
-                      run.recorded, run.replayed, run.truth, run.warnings)
+        result = ReplayResult(path, selected, mechanism, parameters)
+        estimator = EstimatorTopics(load_mechanism(mechanism), EstimatorSettings(**parameters))
+        writer = stack.enter_context(
+            Writer(output, version=9, storage_plugin=StoragePlugin.MCAP))
+        _Replay(reader, result, estimator).run(writer, progress)
+        return result
 
 
-def checked_values(values: Mapping[str, Any]) -> dict[str, Any]:
+def check_parameters(values: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return the values of all parameters of the estimator, those that are not given by default.
+    Return the values of all parameters of the estimator; missing values have their defaults.
 
-    :raises FourbarError: one of them is unknown, of the wrong type, or out of range.
+    :raises FourbarError: an unknown parameter, or a value of the wrong type or out of range.
     """
     rows = {row.name: row for row in PARAMETERS}
-    if unknown := sorted(set(values) - set(rows)):
-        raise ReplayError(f'unknown setting {", ".join(unknown)} (known are {", ".join(rows)})')
+    check_keys(values, (), 'settings of the estimator', ReplayError, optional=rows)
     return {name: row.check(values.get(name, row.default)) for name, row in rows.items()}
 
 
-def find_namespace(stored: StoredBag, wanted: str | None = None) -> str:
+def find_namespace(reader: BagReader, requested: str | None = None) -> str:
     """
-    Find the suite in a bag whose estimator there is something for.
+    Find the namespace of the suite in a bag, and check the inputs of the estimator in it.
 
-    :param wanted: its namespace, as '/table1' or 'table1'.
+    :param requested: namespace, as '/table1' or 'table1'.
     :returns: '' or a name that begins with '/'.
-    :raises BagError: there is none, more than one, or its topics have another type.
+    :raises BagError: no suite, more than one, a topic of another type or without message.
     """
-    topics = stored.topics
-    found = sorted({
-        topic[:-len(name) - 1] for topic in topics for name in INPUTS
-        # Ground truth is no measurement, unless somebody has a suite of that name.
-        if topic.endswith(f'/{name}') and (wanted or not topic.endswith(f'/sim/{name}'))})
-    whole = [space for space in found if all(f'{space}/{name}' in topics for name in INPUTS)]
-    if wanted is not None:
-        chosen = '/'.join(['', *filter(None, wanted.split('/'))]).rstrip('/')
-        if chosen not in whole and chosen not in found:
-            others = ', '.join(
-                space or '/' for space in found if not space.endswith('/sim'))
-            raise BagError(f'{stored.path}: nothing in the namespace {chosen or "/"}: '
-                           + (f'there are {others}' if others else _what_it_has(topics)))
+    path, topics = reader.path, reader.topics
+    present = {topic[:-len(name) - 1] for topic in topics for name in INPUTS
+               if topic.endswith(f'/{name}')}
+    # sim/flywheel_states is ground truth, unless a suite has the namespace /sim.
+    suites = sorted(space for space in present if not space.endswith('/sim'))
+    available = f'it has {", ".join(sorted(topics))}'
+    if requested is not None:
+        namespace = absolute_name(requested).rstrip('/')
+        if namespace not in present:
+            listed = ', '.join(space or '/' for space in suites)
+            raise bag_error(path, 'no_topic', f': no suite in the namespace {namespace or "/"}: '
+                            + (f'there are {listed}' if listed else available),
+                            topic=namespace, value=suites)
     else:
-        spaces = whole or found
-        if len(spaces) > 1:
-            raise BagError(f'{stored.path} holds more than one suite: choose a namespace of '
-                           f'{", ".join(space or "/" for space in spaces)}')
-        chosen = spaces[0] if spaces else ''
+        complete = [space for space in suites
+                    if all(f'{space}/{name}' in topics for name in INPUTS)]
+        namespace, *others = complete or suites or ['']
+        if others:
+            raise bag_error(path, 'ambiguous', ' holds more than one suite: select one of the '
+                            f'namespaces {", ".join(space or "/" for space in suites)}',
+                            value=complete or suites)
     for name in INPUTS:
-        topic = f'{chosen}/{name}'
-        counts = [connection.msgcount for connection in stored.connections
-                  if connection.topic == topic]
-        if not counts:
-            raise BagError(f'{stored.path}: no topic {topic}: {_what_it_has(topics)}')
-        if not any(counts):
-            raise BagError(f'{stored.path}: no message on {topic}')
-    for name in (*INPUTS, FLYWHEEL_COMMAND, ESTIMATE_LINK_STATES, ESTIMATE_INNOVATION,
-                 SIM_LINK_STATES):
-        kind = topics.get(f'{chosen}/{name}', JOINT_STATE)
-        if kind != JOINT_STATE:
-            raise BagError(f'{stored.path}: {chosen}/{name} is {kind}, not {JOINT_STATE}')
-    return chosen
+        topic = f'{namespace}/{name}'
+        if topic not in topics:
+            raise bag_error(path, 'no_topic', f': no topic {topic}: {available}', topic=topic)
+        if not reader.count(topic):
+            raise bag_error(path, 'no_message', f': no message on {topic}', topic=topic)
+    for name in (*INPUTS, names.FLYWHEEL_COMMAND, *LOGGED):
+        topic = f'{namespace}/{name}'
+        if (kind := topics.get(topic, JOINT_STATE)) != JOINT_STATE:
+            raise bag_error(path, 'type', f': {topic} is {kind}, not {JOINT_STATE}',
+                            topic=topic, value=kind)
+    return namespace
 
 
-def _what_it_has(topics: Mapping[str, str]) -> str:
-    return f'it has {", ".join(sorted(topics))}'
-
-
-def _recorded_mechanism(stored: StoredBag, namespace: str) -> str | None:
-    """Return the mechanism that the device names in the bag, the last one if it does often."""
+def _recorded_mechanism(reader: BagReader, namespace: str) -> str | None:
+    """Return the mechanism of the last device status that names one."""
     name = None
-    connections = [connection for connection in stored.connections
-                   if connection.topic == f'{namespace}/device_status'
+    connections = [connection for connection in reader.connections
+                   if connection.topic == f'{namespace}/{names.DEVICE_STATUS}'
                    and connection.msgtype == DIAGNOSTIC_STATUS]
-    for connection, _, data in stored.messages(connections):
-        for pair in stored.content(connection, data).values:
-            if pair.key == 'mechanism' and pair.value:
-                name = str(pair.value)
+    for connection, _, data in reader.messages(connections):
+        for item in reader.deserialize(connection, data).values:
+            if item.key == 'mechanism' and item.value:
+                name = str(item.value)
     if name is not None:
         try:
             load_mechanism(name)
         except FourbarError as error:
-            raise ReplayError(f'the mechanism that the bag names is not to be had, give another: '
-                              f'{error}') from error
+            raise ReplayError(f'the mechanism that the bag names is not available, give another '
+                              f'with --mechanism: {error}', reason='mechanism', name=name
+                              ) from error
     return name
 
 
-class _Run:
+class _Replay:
     """One pass over a bag."""
 
-    def __init__(self, stored: StoredBag, namespace: str, topics: EstimatorTopics) -> None:
-        self.ticks_ns: list[int] = []
-        self.waiting = 0
-        self.recorded, self.replayed, self.truth = Side(), Side(), LinkLog()
-        self.warnings: list[str] = []
-        self._stored = stored
+    def __init__(self, reader: BagReader, result: ReplayResult, topics: EstimatorTopics) -> None:
+        self._reader = reader
+        self._result = result
         self._topics = topics
-        self._namespace = namespace
-        self._relative = {f'{namespace}/{name}': name for name in (
-            *INPUTS, FLYWHEEL_COMMAND, *OUTPUTS, ESTIMATE_WAITING, SIM_LINK_STATES)}
-        self._faults: Counter[str] = Counter()
-        self._seen_faults: dict[str, float | None] = {}
+        self._relative_names = {f'{result.namespace}/{name}': name for name in (
+            *INPUTS, names.FLYWHEEL_COMMAND, *OUTPUTS, names.ESTIMATE_WAITING, *LOGGED)}
+        self._logs = dict(zip(LOGGED, (
+            result.recorded.states, result.recorded.innovations, result.truth)))
+        self._fault_ticks: Counter[str] = Counter()
 
-    def write_to(self, writer: Any, progress: Progress | None) -> None:
-        """Go through all messages and write the new bag."""
-        copy = copier(writer, self.warnings.append)
-        publish = _Publisher(writer, self._namespace, self._stored.connections)
-        copies = [connection for connection in self._stored.connections
-                  if self._relative.get(connection.topic) not in (*OUTPUTS, ESTIMATE_WAITING)]
-        for connection in copies:
-            copy(connection)
-        stream: Any = self._stored.messages()
-        total = sum(connection.msgcount for connection in self._stored.connections)
-        for connection, logged_ns, data in progress(stream, total) if progress else stream:
-            name = self._relative.get(connection.topic)
-            if name not in OUTPUTS and name != ESTIMATE_WAITING:
+    def run(self, writer: Any, progress: Progress) -> None:
+        """Process all messages, and write the new bag."""
+        reader, outputs = self._reader, (*OUTPUTS, names.ESTIMATE_WAITING)
+        copy = connection_copier(writer, self._result.warnings.append)
+        publish = _EstimateWriter(writer, self._result.namespace, reader.connections)
+        for connection in reader.connections:
+            if self._relative_names.get(connection.topic) not in outputs:
+                copy(connection)
+        for connection, logged_ns, data in reader.messages(progress=progress):
+            name = self._relative_names.get(connection.topic, '')
+            if name not in outputs:
                 writer.write(copy(connection), logged_ns, data)
-            if connection.topic == DIAGNOSTICS and connection.msgtype == DIAGNOSTIC_ARRAY:
-                self._diagnosed(self._stored.content(connection, data))
-            elif name in (*INPUTS, ESTIMATE_LINK_STATES, ESTIMATE_INNOVATION, SIM_LINK_STATES) or (
-                    name == FLYWHEEL_COMMAND and self._topics.needs_commands):
-                for answer in self._take(name, self._stored.content(connection, data)):
-                    publish(answer, logged_ns)
-        self._conclude()
+            if connection.topic == names.DIAGNOSTICS and connection.msgtype == DIAGNOSTIC_ARRAY:
+                self._read_diagnostics(reader.deserialize(connection, data))
+            elif name in (*INPUTS, *LOGGED) or (
+                    name == names.FLYWHEEL_COMMAND and self._topics.needs_commands):
+                for message in self._receive(name, reader.deserialize(connection, data)):
+                    publish(message, logged_ns)
+        self._finish()
 
-    def _take(self, name: str, message: Any) -> tuple[OutputMessage, ...]:
-        """Note a message, and hand it to the estimator if it is for it."""
+    def _receive(self, name: str, message: Any) -> tuple[OutputMessage, ...]:
+        """Log a recorded output, or return the estimator's answer to an input."""
+        result = self._result
         stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-        if name in (ESTIMATE_LINK_STATES, SIM_LINK_STATES):
-            log = self.recorded.states if name == ESTIMATE_LINK_STATES else self.truth
-            log.add(stamp_ns, message.name, message.position, message.velocity)
-            return ()
-        if name == ESTIMATE_INNOVATION:
-            self.recorded.nis.add(stamp_ns, message.name, message.position)
+        if name in self._logs:
+            self._logs[name].add(stamp_ns, message.name, message.position, message.velocity)
             return ()
         answer = self._topics.receive(name, stamp_ns, message.name, message.position,
                                       message.velocity, message.effort)
         messages = tuple(answer.messages)
-        if name == FLYWHEEL_STATES and not answer.rejection and (
-                not self.ticks_ns or self.ticks_ns[-1] != stamp_ns):
-            self._note_tick(stamp_ns, messages)
+        if name == names.FLYWHEEL_STATES and not answer.rejection and (
+                not result.ticks_ns or result.ticks_ns[-1] != stamp_ns):
+            self._log_tick(stamp_ns, messages)
         return messages
 
-    def _note_tick(self, stamp_ns: int, messages: tuple[OutputMessage, ...]) -> None:
-        self.ticks_ns.append(stamp_ns)
+    def _log_tick(self, stamp_ns: int, messages: tuple[OutputMessage, ...]) -> None:
+        result = self._result
+        result.ticks_ns.append(stamp_ns)
+        logs = {names.ESTIMATE_LINK_STATES: result.replayed.states,
+                names.ESTIMATE_INNOVATION: result.replayed.innovations}
         for message in messages:
-            if message.topic == ESTIMATE_LINK_STATES:
-                angles, rates = (values.tolist() for values in message.values[:2])
-                self.replayed.states.add(stamp_ns, message.names, angles, rates)
-            elif message.topic == ESTIMATE_INNOVATION:
-                self.replayed.nis.add(stamp_ns, message.names, message.values[0].tolist())
-            elif message.topic == ESTIMATE_WAITING:
-                self.waiting += 1
-        self._faults.update(f'{sensor}: {fault}' for sensor, fault in
-                            self._topics.estimator.sensor_faults().items())
+            if message.topic in logs:
+                logs[message.topic].add(
+                    stamp_ns, message.names, *(values.tolist() for values in message.values[:2]))
+            result.waiting += message.topic == names.ESTIMATE_WAITING
+        self._fault_ticks.update(f'{sensor}: {fault}' for sensor, fault in
+                                 self._topics.estimator.sensor_faults().items())
 
-    def _diagnosed(self, message: Any) -> None:
-        """Note what the recorded estimator said of its samples; the last word counts."""
+    def _read_diagnostics(self, message: Any) -> None:
+        """Read the counters of the recorded estimator; the last message has the totals."""
         for status in message.status:
-            if status.name != f'{self._namespace}/{NODE}'.lstrip('/'):
+            if status.name != f'{self._result.namespace}/{NODE}'.lstrip('/'):
                 continue
-            values = {pair.key: pair.value for pair in status.values}
-            for fault in filter(None, values.get('sensor_faults', '').split(', ')):
-                self._seen_faults.setdefault(fault, None)
-            found = Judgements(_count(values.get('starts')), faults=self._seen_faults)
-            for kind in COUNTERS:
-                getattr(found, kind).update(
-                    (key[len(kind) + 1:], _count(value)) for key, value in values.items()
-                    if key.startswith(f'{kind}_'))
-            self.recorded.judgements = found
+            values = {item.key: item.value for item in status.values}
+            recorded = self._result.recorded
+            faults = recorded.counters.faults if recorded.counters else {}
+            faults.update(dict.fromkeys(
+                filter(None, values.get('sensor_faults', '').split(', '))))
+            rejected, gated = (
+                {key[len(prefix):]: _as_count(value) for key, value in values.items()
+                 if key.startswith(prefix)} for prefix in ('rejected_', 'gated_'))
+            recorded.counters = EstimatorCounters(
+                _as_count(values.get('starts', '')), rejected, gated, faults)
 
-    def _conclude(self) -> None:
+    def _finish(self) -> None:
+        """Take the counters of the replayed estimator."""
         estimator = self._topics.estimator
-        periods = np.diff(np.array(self.ticks_ns, dtype=np.int64))
-        period = float(np.median(periods)) * 1e-9 if len(periods) else 0.0
-        self.replayed.judgements = Judgements(
+        periods = np.diff(np.array(self._result.ticks_ns, dtype=np.int64))
+        period_s = float(np.median(periods)) * 1e-9 if len(periods) else 0.0
+        self._result.replayed.counters = EstimatorCounters(
             estimator.starts, dict(estimator.rejected), dict(estimator.gated),
-            {fault: count * period for fault, count in self._faults.items()})
+            {fault: count * period_s for fault, count in self._fault_ticks.items()})
 
 
-def _count(text: str | None) -> int:
-    return int(text) if text is not None and text.isdecimal() else 0
+def _as_count(text: str) -> int:
+    return int(text) if text.isdecimal() else 0
 
 
-class _Publisher:
-    """Writes what the estimator says into a bag."""
+class _EstimateWriter:
+    """Writes messages of the estimator into a bag, with the QoS profiles of the recorded ones."""
 
     def __init__(self, writer: Any, namespace: str, recorded: Sequence[Connection]) -> None:
         from rosbags.typesys import get_typestore, Stores
@@ -378,34 +354,30 @@ class _Publisher:
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._namespace = namespace
         self._connections: dict[str, Any] = {}
-        # As they were offered to the recorder.
-        self._offered: dict[str, Any] = {
+        self._recorded: dict[str, Any] = {
             connection.topic: connection.ext for connection in recorded}
-        for name in (*OUTPUTS, ESTIMATE_WAITING):
-            if name == ESTIMATE_WAITING or not OUTPUTS[name].optional:
-                self._offer(name)
+        for name in (*OUTPUTS, names.ESTIMATE_WAITING):
+            if name == names.ESTIMATE_WAITING or not OUTPUTS[name].optional:
+                self._add_connection(name)
 
-    def _offer(self, name: str) -> None:
-        topic, offered = f'{self._namespace}/{name}', self._offered
-        profiles = offered[topic].offered_qos_profiles if topic in offered else ()
+    def _add_connection(self, name: str) -> None:
+        topic, recorded = f'{self._namespace}/{name}', self._recorded
         self._connections[name] = self._writer.add_connection(
-            topic, HEADER if name == ESTIMATE_WAITING else JOINT_STATE, typestore=self._store,
-            offered_qos_profiles=profiles)
+            topic, JOINT_STATE if name in OUTPUTS else HEADER, typestore=self._store,
+            offered_qos_profiles=recorded[topic].offered_qos_profiles if topic in recorded else ())
 
     def __call__(self, message: OutputMessage, logged_ns: int) -> None:
         """Write one message."""
         if message.topic not in self._connections:
-            self._offer(message.topic)
-        types = self._store.types
+            self._add_connection(message.topic)
+        types, output = self._store.types, OUTPUTS.get(message.topic)
         sec, nanosec = divmod(message.stamp_ns, 1_000_000_000)
         stamp = types['builtin_interfaces/msg/Time'](sec=sec, nanosec=nanosec)
-        frame = OUTPUTS[message.topic].frame if message.topic in OUTPUTS else ''
-        content = types[HEADER](stamp=stamp, frame_id=frame)
-        kind = HEADER
-        if message.topic in OUTPUTS:
-            kind = JOINT_STATE
+        content = types[HEADER](stamp=stamp, frame_id=output.frame if output else '')
+        if output:
             arrays = {name: np.empty(0) for name in ('position', 'velocity', 'effort')}
-            arrays.update(zip(OUTPUTS[message.topic].fields, message.values))
-            content = types[kind](header=content, name=list(message.names), **arrays)
+            # A field of a structured array is strided, which rosbags does not serialize.
+            arrays.update(zip(output.fields, map(np.ascontiguousarray, message.values)))
+            content = types[JOINT_STATE](header=content, name=list(message.names), **arrays)
         self._writer.write(self._connections[message.topic], logged_ns,
-                           self._store.serialize_cdr(content, kind))
+                           self._store.serialize_cdr(content, JOINT_STATE if output else HEADER))

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How far a replay is from the recorded estimates, and both from the ground truth."""
+"""Differences between replayed estimates, recorded estimates and ground truth."""
 
 from __future__ import annotations
 
@@ -10,24 +10,31 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from fourbar_ros.analysis.bags import Floats, JointSeries, Nanoseconds
-from fourbar_ros.analysis.replay import Replay, ReplayError, Side
+from fourbar_ros.analysis.replay import (
+    EstimatorCounters,
+    EstimatorRecord,
+    ReplayError,
+    ReplayResult,
+)
 from fourbar_ros.estimation.estimator_settings import SETTINGS
 from fourbar_ros.mechanism import LINK_NAMES
 from fourbar_ros.mechanism.angles import wrap_angles
 import numpy as np
 
+# Default of the time without statistics after the start of both filters, whose rates have not
+# converged yet [s].
 SKIP_S = 1.0
-"""A filter needs a moment to find the rates; what it says before would outweigh the rest [s]."""
 
 DIFFERENCES = ('replayed_minus_recorded', 'recorded_minus_truth', 'replayed_minus_truth')
 ROWS = (('angle_rms_rad', 'angle, rms [deg]'), ('angle_max_rad', 'angle, max [deg]'),
         ('rate_rms_rad_s', 'rate, rms [deg/s]'), ('rate_max_rad_s', 'rate, max [deg/s]'))
+SOURCES = ('recorded', 'replayed')
 
 
 @dataclass(frozen=True, eq=False)
-class Difference:
+class StateDifference:
     """
-    One series of link states minus another, where both have the same stamp.
+    Difference of two series of link states at their common stamps.
 
     :param stamp_ns: (n,) [ns].
     :param angles: (n, 4) in (-pi, pi] [rad].
@@ -38,75 +45,77 @@ class Difference:
     angles: Floats
     rates: Floats
 
-    def later(self, from_ns: int) -> Difference:
-        """Leave out what is before a stamp."""
+    def since(self, from_ns: int) -> StateDifference:
+        """Return the part from a stamp on."""
         kept = self.stamp_ns >= from_ns
-        return Difference(self.stamp_ns[kept], self.angles[kept], self.rates[kept])
+        return StateDifference(self.stamp_ns[kept], self.angles[kept], self.rates[kept])
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class ReplayComparison:
     """
-    A replay beside what was recorded.
+    Comparison of a replay with the recorded estimates and ground truth.
 
-    :param from_ns: stamp from which on the numbers count.
-    :param replayed_minus_recorded: None where the bag has no estimates.
-    :param recorded_minus_truth: None where it has no estimates or no ground truth.
-    :param replayed_minus_truth: None where it has no ground truth.
-    :param identical: whether both sides have the same stamps and values to the last bit; None
-        where the bag has no estimates.
+    :param from_ns: first stamp of the statistics [ns].
+    :param replayed_minus_recorded: None without estimates in the bag.
+    :param recorded_minus_truth: None without estimates or ground truth in the bag.
+    :param replayed_minus_truth: None without ground truth in the bag.
+    :param identical: whether stamps and values of both estimates are equal bit for bit; None
+        without estimates in the bag.
     """
 
-    replay: Replay
+    replay: ReplayResult
     from_ns: int
-    replayed_minus_recorded: Difference | None
-    recorded_minus_truth: Difference | None
-    replayed_minus_truth: Difference | None
+    replayed_minus_recorded: StateDifference | None
+    recorded_minus_truth: StateDifference | None
+    replayed_minus_truth: StateDifference | None
     identical: bool | None
 
-    def differences(self) -> Iterator[tuple[str, Difference]]:
-        """Go through those that there are, by name."""
+    def differences(self) -> Iterator[tuple[str, StateDifference]]:
+        """Iterate over the available differences by name."""
         for name in DIFFERENCES:
             if (difference := getattr(self, name)) is not None:
                 yield name, difference
 
+    def seconds(self, stamp_ns: Nanoseconds | list[int]) -> Floats:
+        """Return the time since the first tick [s]."""
+        return (np.array(stamp_ns) - self.replay.ticks_ns[0]).astype(np.float64) * 1e-9
 
-def compare(replay: Replay, skip: float = SKIP_S) -> Comparison:
-    """
-    Bring the two sides and the ground truth together.
 
-    :param skip: how long after the first estimates of both sides the numbers begin to count [s].
-    :raises ReplayError: no estimate at all came of the replay, or none so late.
+def compare(replay: ReplayResult, skip: float = SKIP_S) -> ReplayComparison:
     """
-    replayed = replay.replayed.states.series('replayed')
-    recorded = replay.recorded.states.series('recorded')
-    truth = replay.truth.series('truth')
+    Compare replayed estimates, recorded estimates and ground truth.
+
+    :param skip: time after the first estimates of both filters without statistics [s].
+    :raises ReplayError: the replay has no estimate, or none after this time.
+    """
+    replayed, recorded, truth = (log.series(name).by_stamp() for name, log in (
+        ('replayed', replay.replayed.states), ('recorded', replay.recorded.states),
+        ('truth', replay.truth)))
     if not len(replayed):
-        raise ReplayError('no estimate came of it: the estimator waited for samples that it '
-                          'could use, or refused every tick ' + _refusals(replay.replayed))
-    # Either may have begun late: a node that was started after the others.
-    first_ns = max(int(each.stamp_ns[0]) for each in (replayed, recorded) if len(each))
+        rejected = replay.replayed.counters.rejected if replay.replayed.counters else {}
+        counts = ', '.join(f'{name} {count}' for name, count in sorted(rejected.items()))
+        raise ReplayError('the replay has no estimate: the estimator received no usable samples '
+                          f'or rejected every tick (rejected: {counts or "none"})',
+                          reason='no_estimate', rejected=rejected)
+    # The later of both starts: nodes start one after the other.
+    first_ns = max(int(series.stamp_ns[0]) for series in (replayed, recorded) if len(series))
     from_ns = first_ns + round(skip * 1e9)
     if not np.any(replayed.stamp_ns >= from_ns):
-        raise ReplayError(f'the replay has no estimate {skip:g} s after both sides have begun: '
-                          'skip less')
-    return Comparison(
+        raise ReplayError(f'the replay has no estimate {skip:g} s after the start of both '
+                          'filters: reduce --skip', reason='skip', name='skip', value=skip)
+    return ReplayComparison(
         replay, from_ns, _difference(replayed, recorded), _difference(recorded, truth),
         _difference(replayed, truth), _identical(replayed, recorded))
 
 
-def _refusals(side: Side) -> str:
-    rejected = side.judgements.rejected if side.judgements is not None else {}
-    return f'(rejected: {_counts(rejected)})'
-
-
-def _difference(left: JointSeries, right: JointSeries) -> Difference | None:
+def _difference(left: JointSeries, right: JointSeries) -> StateDifference | None:
     stamps, in_left, in_right = np.intersect1d(
         left.stamp_ns, right.stamp_ns, assume_unique=True, return_indices=True)
     if not len(stamps):
         return None
-    return Difference(stamps, wrap_angles(left.position[in_left] - right.position[in_right]),
-                      left.velocity[in_left] - right.velocity[in_right])
+    return StateDifference(stamps, wrap_angles(left.position[in_left] - right.position[in_right]),
+                           left.velocity[in_left] - right.velocity[in_right])
 
 
 def _identical(replayed: JointSeries, recorded: JointSeries) -> bool | None:
@@ -116,10 +125,11 @@ def _identical(replayed: JointSeries, recorded: JointSeries) -> bool | None:
                for name in ('stamp_ns', 'position', 'velocity'))
 
 
-def as_json(comparison: Comparison) -> dict[str, Any]:
-    """Return all numbers, nested, units at the end of their names; None for what is not known."""
+def as_json(comparison: ReplayComparison) -> dict[str, Any]:
+    """Return all numbers, nested, with units as suffixes of their names; None for unknown."""
     replay = comparison.replay
-    first_ns = replay.ticks_ns[0]
+    duration_s, from_s = comparison.seconds([replay.ticks_ns[-1], comparison.from_ns]).tolist()
+    counters = {source: getattr(replay, source).counters for source in SOURCES}
     return {
         'bag': replay.bag.absolute().name,
         'namespace': replay.namespace or '/',
@@ -127,55 +137,48 @@ def as_json(comparison: Comparison) -> dict[str, Any]:
         'settings': dict(replay.settings),
         'ticks': len(replay.ticks_ns),
         'ticks_without_estimate': replay.waiting,
-        'duration_s': (replay.ticks_ns[-1] - first_ns) * 1e-9,
-        'compared_from_s': (comparison.from_ns - first_ns) * 1e-9,
+        'duration_s': duration_s,
+        'compared_from_s': from_s,
         'identical': comparison.identical,
         **dict.fromkeys(DIFFERENCES),
-        **{name: _statistics(difference.later(comparison.from_ns))
+        **{name: _statistics(difference.since(comparison.from_ns))
            for name, difference in comparison.differences()},
         'nis_per_degree_of_freedom': {
-            'recorded': mean_nis(replay.recorded, comparison.from_ns),
-            'replayed': mean_nis(replay.replayed, comparison.from_ns)},
-        'recorded': _judgements(replay.recorded),
-        'replayed': _judgements(replay.replayed),
+            source: mean_nis(getattr(replay, source), comparison.from_ns) for source in SOURCES},
+        **{source: asdict(of_one) if of_one else None for source, of_one in counters.items()},
         'warnings': replay.warnings,
     }
 
 
-def _statistics(difference: Difference) -> dict[str, Any] | None:
-    """Return rms and largest of each link; NaN, which a message left out, does not count."""
+def _statistics(difference: StateDifference) -> dict[str, Any] | None:
+    """Return rms and largest absolute difference of each link; NaN is left out."""
     if not len(difference.stamp_ns):
         return None
-    found: dict[str, Any] = {'samples': len(difference.stamp_ns)}
+    statistics: dict[str, Any] = {'samples': len(difference.stamp_ns)}
     for link, name in enumerate(LINK_NAMES):
-        values = {}
+        statistics[name] = {}
         for kind, unit, array in (('angle', 'rad', difference.angles),
                                   ('rate', 'rad_s', difference.rates)):
             known = array[np.isfinite(array[:, link]), link]
-            values[f'{kind}_rms_{unit}'] = (
+            statistics[name][f'{kind}_rms_{unit}'] = (
                 float(np.sqrt(np.mean(known ** 2))) if len(known) else None)
-            values[f'{kind}_max_{unit}'] = (
+            statistics[name][f'{kind}_max_{unit}'] = (
                 float(np.max(np.abs(known))) if len(known) else None)
-        found[name] = values
-    return found
+    return statistics
 
 
-def mean_nis(side: Side, from_ns: int) -> float | None:
+def mean_nis(record: EstimatorRecord, from_ns: int) -> float | None:
     """Return NIS over degrees of freedom from a stamp on, None without an update."""
-    rows = side.nis.rows()
-    rows = rows[rows[:, 0] >= from_ns]
-    return float(rows[:, 1].sum() / rows[:, 2].sum()) if len(rows) else None
-
-
-def _judgements(side: Side) -> dict[str, Any] | None:
-    return None if side.judgements is None else asdict(side.judgements)
+    stamps, nis, degrees = record.nis()
+    kept = stamps >= from_ns
+    return float(nis[kept].sum() / degrees[kept].sum()) if kept.any() else None
 
 
 COLUMN, LABEL = 12, 32
 
 
-def as_text(comparison: Comparison) -> str:
-    """Return the comparison as a table to be read, in degrees."""
+def as_text(comparison: ReplayComparison) -> str:
+    """Return the comparison as a table for the terminal, in degrees."""
     data = as_json(comparison)
     without = data['ticks_without_estimate']
     lines = [
@@ -186,64 +189,48 @@ def as_text(comparison: Comparison) -> str:
         value, unit = data['settings'][row.name], f' {row.unit}' if row.unit else ''
         lines.append(f'  {row.name:<20} {value:g}{unit}' if isinstance(value, float)
                      else f'  {row.name:<20} {value}{unit}')
-    lines += ['', f'{"from " + format(data["compared_from_s"], "g") + " s on":<{LABEL}}'
-              + ''.join(f'{name:>{COLUMN}}' for name in LINK_NAMES)]
+    lines += ['', _row(f'from {data["compared_from_s"]:g} s on', *LINK_NAMES)]
     for name, _ in comparison.differences():
-        lines += _rows(name, data[name])
+        title = name.replace('_minus_', ' - ').replace('truth', 'ground truth')
+        statistics = data[name]
+        lines.append(title if statistics else f'{title}: no sample in this time')
+        for key, label in ROWS if statistics else ():
+            values = [statistics[link][key] for link in LINK_NAMES]
+            lines.append(_row(f'  {label}', *(
+                None if value is None else float(np.degrees(value)) for value in values)))
     if comparison.identical is None:
-        lines.append('no estimates in the bag to compare with')
+        lines.append('the bag has no estimates for a comparison')
     elif comparison.identical:
-        lines.append('replayed and recorded estimates are equal to the last bit')
-    lines += ['', f'{"":<{LABEL}}{"recorded":>{COLUMN}}{"replayed":>{COLUMN}}']
-    nis = data['nis_per_degree_of_freedom']
-    lines.append(f'{"NIS per degree of freedom":<{LABEL}}' + ''.join(
-        f'{_number(nis[side]):>{COLUMN}}' for side in ('recorded', 'replayed')))
-    lines += _judgement_rows(data['recorded'], data['replayed'])
-    return '\n'.join(lines)
+        lines.append('replayed and recorded estimates are equal bit for bit')
+    lines += ['', _row('', *SOURCES), _row('NIS per degree of freedom', *(
+        data['nis_per_degree_of_freedom'][source] for source in SOURCES))]
+    return '\n'.join([*lines, *_counter_rows(data['recorded'], data['replayed'])])
 
 
-def _rows(name: str, statistics: dict[str, Any] | None) -> list[str]:
-    title = name.replace('_minus_', ' - ').replace('truth', 'ground truth')
-    if statistics is None:
-        return [f'{title}: nothing so late']
-    rows = [title]
-    for key, label in ROWS:
-        values = [statistics[link][key] for link in LINK_NAMES]
-        rows.append(f'{"  " + label:<{LABEL}}' + ''.join(
-            f'{_number(None if value is None else np.degrees(value)):>{COLUMN}}'
-            for value in values))
-    return rows
+def _row(label: str, *values: Any) -> str:
+    """Return a line of the table: label and columns."""
+    texts = ('-' if value is None else f'{value:.4g}' if isinstance(value, float) else f'{value}'
+             for value in values)
+    return f'{label:<{LABEL}}' + ''.join(f'{text:>{COLUMN}}' for text in texts)
 
 
-def _judgement_rows(recorded: dict[str, Any] | None, replayed: dict[str, Any]) -> list[str]:
-    """Return a row for all that one of the sides counts; `-` where the bag does not tell."""
-    rows = []
+def _counter_rows(recorded: dict[str, Any] | None, replayed: dict[str, Any]) -> list[str]:
+    """Return a line for each counter of either filter; `-` where the bag has none."""
+    known = recorded or asdict(EstimatorCounters())
 
-    def add(label: str, left: Any, right: Any) -> None:
-        known = '-' if recorded is None else left
-        rows.append(f'{label:<{LABEL}}{known:>{COLUMN}}{right:>{COLUMN}}')
+    def row(label: str, left: Any, right: Any) -> str:
+        return _row(label, left if recorded else None, right)
 
-    other = recorded or {'starts': 0, 'rejected': {}, 'gated': {}, 'faults': {}}
-    add('starts of the filter', other['starts'], replayed['starts'])
+    rows = [row('starts of the filter', known['starts'], replayed['starts'])]
     for kind, label in (('rejected', 'rejected messages'), ('gated', 'gated samples')):
-        add(label, sum(other[kind].values()), sum(replayed[kind].values()))
-        for name in sorted({*other[kind], *replayed[kind]}):
-            add(f'  {name}', other[kind].get(name, 0), replayed[kind].get(name, 0))
-    faults = sorted({*other['faults'], *replayed['faults']})
-    if not faults:
-        add('sensor faults', 'none', 'none')
-    else:
-        rows.append('sensor faults')
+        left, right = known[kind], replayed[kind]
+        rows.append(row(label, sum(left.values()), sum(right.values())))
+        rows += [row(f'  {name}', left.get(name, 0), right.get(name, 0))
+                 for name in sorted({*left, *right})]
+    faults = sorted({*known['faults'], *replayed['faults']})
+    rows.append('sensor faults' if faults else row('sensor faults', 'none', 'none'))
     for fault in faults:
         seconds = replayed['faults'].get(fault)
-        add(f'  {fault}', 'named' if fault in other['faults'] else 'no',
-            'no' if seconds is None else f'{seconds:.3g} s')
+        rows.append(row(f'  {fault}', 'reported' if fault in known['faults'] else 'no',
+                        'no' if seconds is None else f'{seconds:.3g} s'))
     return rows
-
-
-def _number(value: float | None) -> str:
-    return '-' if value is None else f'{value:.4g}'
-
-
-def _counts(counts: dict[str, int]) -> str:
-    return ', '.join(f'{name} {count}' for name, count in sorted(counts.items())) or 'none'

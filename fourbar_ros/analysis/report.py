@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One self-contained HTML page and one JSON file from a bag."""
+"""One self-contained HTML page and one JSON file of metrics from a bag."""
 
 from __future__ import annotations
 
@@ -11,60 +11,66 @@ from functools import partial
 import html as markup
 import json
 from pathlib import Path
+from string import Template
 from typing import Any
 
-from fourbar_ros.analysis.bags import BagError, read_bag, Recording
-from fourbar_ros.analysis.manoeuvre import find_motion
-from fourbar_ros.analysis.metrics import MEANINGS, metrics
-from fourbar_ros.common import names
+from fourbar_ros.analysis.bag_reader import BagError
+from fourbar_ros.analysis.bags import Bag, read_bag
+from fourbar_ros.analysis.manoeuvre import find_manoeuvre
+from fourbar_ros.analysis.metrics import compute_metrics, METRICS
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.common.progress import Progress
+from fourbar_ros.common.names import DEVICE_STATUS
+from fourbar_ros.common.output_files import write_files
+from fourbar_ros.common.progress import no_progress, Progress
 from fourbar_ros.mechanism import load_mechanism, Mechanism
 import numpy as np
 
+TEMPLATE = Path(__file__).with_name('report.html')
 
-class ReportError(FourbarError):
-    """A report that cannot be written."""
-
-
-# Name of the figure function, heading, what to see in it.
+# Name of the figure function, heading, caption.
 SECTIONS = (
     ('linkage', 'The motion',
-     'Seen from above the table at equal intervals of the step, the mass centre of the whole '
-     'linkage (+) at the origin; dashed: the goal. The arc around each wheel is its absolute '
-     'speed, counter-clockwise from the top, as a share of the largest in this motion.'),
+     'Top view of the linkage at equal intervals of the step, with its centre of mass (+) at the '
+     'origin; dashed: the goal. The arc around each wheel is its absolute speed, '
+     'counter-clockwise from the top, as a fraction of the largest speed in this motion.'),
     ('angles', 'Link angles',
-     'The insets magnify 0.2 s at the middle of the step. Dotted verticals, here and below: '
+     'The insets magnify 0.2 s at the middle of the step. Dotted vertical lines, here and below: '
      'setpoint and end of the step.'),
     ('errors', 'Tracking and estimate errors',
-     'Above, how far links a and b are from the reference: coloured in truth, grey as the '
-     'controller sees it. Below, how wrong the estimate is, over the band of two standard '
-     'deviations that the filter itself claims: 95 % should lie '
-     'inside. Without ground truth in the bag, only what the controller sees.'),
+     'Top: tracking error of links a and b; coloured: ground truth, grey: the estimate that the '
+     'controller uses. Below: estimate error, and the band of two standard deviations of the '
+     "filter's covariance, which contains 95 % of the errors of a consistent filter. Without "
+     'ground truth in the bag only the tracking error of the estimate is shown.'),
     ('wheels', 'Flywheels',
-     'Opposite wheels carry the same load in a parallelogram: dashed curves (c, d) lie on solid '
-     'ones (a, b). Speeds that do not return to zero are momentum that friction has moved.'),
+     'Opposite wheels carry equal loads in a parallelogram: dashed curves (c, d) cover solid '
+     'ones (a, b). A speed that does not return to zero is momentum transferred by friction.'),
     ('energy', 'Energy',
-     'Kinetic energy of the wheels from their absolute speeds, the integral of the paper (unit '
-     'J s, so not an energy), and the mechanical work of the motors.'),
+     'Kinetic energy of the wheels from their absolute speeds (paper eq. 7), the integral of '
+     'paper eq. 9 (unit J s, so not an energy), and the mechanical work of the motors.'),
     ('timing', 'Loop timing',
-     'Time between a tick and the command that answers it, measured by the device on a steady '
-     'clock. Solid line: median; dashed: 99th percentile; red: control period.'),
+     'Time between a tick and the command that answers it, measured by the device with a '
+     'monotonic clock. Solid line: median; dashed: 99th percentile; red: control period.'),
     ('innovations', 'Filter consistency',
-     'Innovations should scatter about zero without a trend. The mean should stay in the '
-     'band: above it the filter trusts itself too much, below it too little.'),
+     'Innovations of a consistent filter are white with zero mean. The mean NIS should stay in '
+     'the band: above it the covariance of the filter is too small, below it too large.'),
 )
 
-# Name, label and how to show it.
+
+def _degrees(value: float) -> str:
+    return f'{np.degrees(value):.3g}°'
+
+
+# Metric, label, and format of each number at the top of the page.
 TILES: tuple[tuple[str, str, Callable[[float], str]], ...] = (
-    ('tracking.rms_rad', 'tracking error, rms', lambda v: f'{np.degrees(v):.3g}°'),
-    ('tracking.final_error_rad', 'final error', lambda v: f'{np.degrees(v):.3g}°'),
-    ('estimate.rms_error_rad', 'estimate error, rms', lambda v: f'{np.degrees(v):.3g}°'),
+    ('tracking.rms_rad', 'tracking error, rms', _degrees),
+    ('tracking.final_error_rad', 'final error', _degrees),
+    ('estimate.rms_error_rad', 'estimate error, rms', _degrees),
     ('flywheel.peak_speed_rad_s', 'peak wheel speed', lambda v: f'{v:.3g} <small>rad/s</small>'),
     ('loop.round_trip_p99_ms', 'round trip, 99 %', lambda v: f'{v:.3g} <small>ms</small>'),
     ('loop.lost', 'lost ticks', lambda v: f'{v:d}'),
 )
-# Without ground truth the estimate has to do.
+
+# Metric in place of one that needs ground truth.
 FALLBACKS = {
     'tracking.rms_rad': 'tracking.estimated_rms_rad',
     'tracking.final_error_rad': 'tracking.estimated_final_error_rad',
@@ -74,66 +80,55 @@ FALLBACKS = {
 
 def write_report(bag: str | Path, html: str | Path, metrics_json: str | Path,
                  mechanism: Mechanism | str | None = None, *, namespace: str | None = None,
-                 progress: Progress | None = None) -> dict[str, Any]:
+                 progress: Progress = no_progress) -> dict[str, Any]:
     """
-    Read a bag, write the page and the metrics.
+    Read a bag, and write the page and the metrics.
 
-    :param mechanism: a preset, a file, or the mechanism itself; None: the one the bag names.
-    :param namespace: of the suite, for a bag that holds more than one.
-    :param progress: wraps each iterable that takes time, given also its length.
+    :param mechanism: a preset, a file, or the mechanism itself; None: the one named in the bag.
+    :param namespace: of the suite, for a bag with more than one.
+    :param progress: wraps each iterable of long work.
     :returns: the metrics, as in the JSON file.
     :raises FourbarError: a bad bag, an unknown mechanism, or files that cannot be written.
     """
-    recording = read_bag(bag, namespace, progress)
+    recorded = read_bag(bag, namespace, progress)
     if isinstance(mechanism, str):
         mechanism = load_mechanism(mechanism)
-    used = mechanism or _recorded_mechanism(recording)
-    result = {'bag': recording.path.absolute().name, **metrics(recording, used)}
-    page = make_page(recording, used, result, progress)
-    _write(Path(metrics_json), json.dumps(result, indent=2, allow_nan=False) + '\n')
-    _write(Path(html), page)
+    used = mechanism or _recorded_mechanism(recorded)
+    result = {'bag': recorded.path.absolute().name, **compute_metrics(recorded, used)}
+    write_files({
+        Path(metrics_json): json.dumps(result, indent=2, allow_nan=False) + '\n',
+        Path(html): make_page(recorded, used, result, progress)})
     return result
 
 
-def _recorded_mechanism(recording: Recording) -> Mechanism | None:
-    """Return the mechanism that the device named, None if it did not or it is not here."""
-    if recording.has(names.DEVICE_STATUS):
-        for status in reversed(recording.statuses(names.DEVICE_STATUS)):
-            if name := status.values.get('mechanism'):
-                try:
-                    return load_mechanism(name)
-                except FourbarError:
-                    return None
-    return None
-
-
-def _write(path: Path, text: str) -> None:
+def _recorded_mechanism(bag: Bag) -> Mechanism | None:
+    """Return the mechanism that the device named, None if it is unknown here."""
     try:
-        path.write_text(text, encoding='utf-8')
-    except OSError as error:
-        raise ReportError(f'cannot write {path}: {error.strerror}') from error
+        return load_mechanism(bag.last_status(DEVICE_STATUS, 'mechanism'))
+    except FourbarError:
+        return None
 
 
-def make_page(recording: Recording, mechanism: Mechanism | None, result: dict[str, Any],
-              progress: Progress | None = None) -> str:
-    """Return the HTML page for the metrics of a recording."""
+def make_page(bag: Bag, mechanism: Mechanism | None, result: dict[str, Any],
+              progress: Progress = no_progress) -> str:
+    """Return the HTML page for the metrics of a bag."""
     from fourbar_ros.analysis import report_figures as figures
     from fourbar_ros.plotting import style
 
-    view = figures.View(recording, find_motion(recording), mechanism)
+    data = figures.ReportData(find_manoeuvre(bag), mechanism)
     parts = []
-    for name, heading, caption in progress(SECTIONS, len(SECTIONS)) if progress else SECTIONS:
+    for name, heading, caption in progress(SECTIONS, len(SECTIONS)):
         try:
-            drawing = style.draw(partial(getattr(figures, name), view), name)
+            drawing = style.page_svg(partial(getattr(figures, name), data), name)
             body = f'<figure>{drawing}<figcaption>{_text(caption)}</figcaption></figure>'
         except BagError as error:
             body = f'<p class="absent">Not in this report: {_text(error)}.</p>'
         parts.append(f'<section id="{name}"><h2>{heading}</h2>{body}</section>')
     title = f'{result["bag"]}: motion report'
-    return _PAGE.format(
-        title=_text(title), style=_style_sheet(style.PALETTE), summary=_summary(recording, result),
+    return Template(TEMPLATE.read_text(encoding='utf-8')).substitute(
+        title=_text(title), colours=_colours(style.PALETTE), summary=_summary(bag, result),
         tiles=_tiles(result), figures='\n'.join(parts), table=_table(result),
-        topics=_topics(recording))
+        topics=_topics(bag))
 
 
 def _text(value: object) -> str:
@@ -145,9 +140,9 @@ def _value(result: dict[str, Any], name: str) -> Any:
     return result.get(group, {}).get(key)
 
 
-def _summary(recording: Recording, result: dict[str, Any]) -> str:
+def _summary(bag: Bag, result: dict[str, Any]) -> str:
     motion = result['motion']
-    began = datetime.fromtimestamp(recording.started_ns * 1e-9).astimezone()
+    began = datetime.fromtimestamp(bag.started_ns * 1e-9).astimezone()
     goal = ', '.join(f'{name.replace("_", " ")} to {np.degrees(motion["goal_rad"][name]):.4g}°'
                      for name in ('link_a', 'link_b') if name in motion['goal_rad'])
     which = (f' (setpoint {motion["setpoint_number"]} of {motion["setpoint_count"]})'
@@ -155,105 +150,51 @@ def _summary(recording: Recording, result: dict[str, Any]) -> str:
     cut = '' if motion['complete'] else ' The recording ends before the step does.'
     return _text(
         f'{goal} in {motion["setpoint_duration_s"]:.4g} s{which}. Recorded '
-        f'{began:%Y-%m-%d %H:%M:%S %Z}: {recording.duration_s:.1f} s, '
-        f'{recording.message_count} messages of {len(recording.topics)} topics.{cut}')
+        f'{began:%Y-%m-%d %H:%M:%S %Z}: {bag.duration_s:.1f} s, '
+        f'{bag.message_count} messages of {len(bag.topics)} topics.{cut}')
 
 
 def _tiles(result: dict[str, Any]) -> str:
     tiles = []
-    for name, label, show in TILES:
+    for name, label, write in TILES:
         value = _value(result, name)
         if value is None and name in FALLBACKS:
-            how = FALLBACKS[name].partition('.')[2].partition('_')[0]
-            value, label = _value(result, FALLBACKS[name]), f'{label} ({how})'
+            source = FALLBACKS[name].partition('.')[2].partition('_')[0]
+            value, label = _value(result, FALLBACKS[name]), f'{label} ({source})'
         if value is not None:
-            tiles.append(f'<div><b>{show(value)}</b><span>{label}</span></div>')
+            tiles.append(f'<div><b>{write(value)}</b><span>{label}</span></div>')
     return ''.join(tiles)
 
 
 def _table(result: dict[str, Any]) -> str:
     rows = []
-    for name, meaning in MEANINGS.items():
+    for name, description in METRICS.items():
         value = _value(result, name)
         if value is None:
             reason = result['missing'].get(name, '')
             number = f'<span title="{_text(reason)}">missing</span>'
         else:
             number = f'{value:d}' if isinstance(value, int) else f'{value:.4g}'
-            if meaning.unit == 'rad':
+            if description.unit == 'rad':
                 number += f'<small>{np.degrees(value):.3g}°</small>'
-        unit = '' if meaning.unit == '1' else meaning.unit
-        rows.append(f'<tr><td><code>{name}</code><p>{_text(meaning.sentence)}</p></td>'
+        unit = '' if description.unit == '1' else description.unit
+        rows.append(f'<tr><td><code>{name}</code><p>{_text(description.meaning)}</p></td>'
                     f'<td class="number">{number}</td><td>{unit}</td></tr>')
     return ''.join(rows)
 
 
-def _topics(recording: Recording) -> str:
+def _topics(bag: Bag) -> str:
     return ''.join(
         f'<tr><td><code>{_text(topic)}</code></td><td>{_text(type_name)}</td>'
-        f'<td class="number">{recording.counts[topic]}</td></tr>'
-        for topic, type_name in sorted(recording.topics.items()))
+        f'<td class="number">{bag.counts[topic]}</td></tr>'
+        for topic, type_name in sorted(bag.topics.items()))
 
 
-def _style_sheet(palette: dict[str, tuple[str, str]]) -> str:
+def _colours(palette: dict[str, tuple[str, str]]) -> str:
+    """Return the CSS variables of the palette, for light and dark backgrounds."""
     def variables(index: int) -> str:
         return ' '.join(f'--{name.replace("_", "-")}: {colours[index]};'
                         for name, colours in palette.items())
 
     return (f':root {{ color-scheme: light dark; {variables(0)} }}\n'
-            f'@media (prefers-color-scheme: dark) {{ :root {{ {variables(1)} }} }}\n{_LAYOUT}')
-
-
-_LAYOUT = """\
-body { margin: 0; background: var(--paper); color: var(--ink);
-  font: 16px/1.5 system-ui, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif; }
-main { max-width: 62rem; margin: 0 auto; padding: 2rem 1.25rem 4rem; }
-h1 { font-size: 1.6rem; line-height: 1.2; margin: 0 0 .4rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.15rem; margin: 2.6rem 0 .6rem; }
-.summary, figcaption, td p, .tiles span { color: var(--muted); }
-.summary { margin: 0 0 1.4rem; }
-.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(9rem, 1fr)); gap: .6rem; }
-.tiles div { background: var(--tile); border-radius: .5rem; padding: .7rem .9rem; }
-.tiles b { display: block; font-size: 1.3rem; font-variant-numeric: tabular-nums; }
-.tiles small { font-size: .95rem; font-weight: 500; }
-.tiles span { font-size: .82rem; }
-figure { margin: 0; }
-svg { display: block; width: 100%; height: auto; }
-svg text { font-family: inherit !important; }
-figcaption { font-size: .88rem; margin-top: .5rem; max-width: 52rem; }
-.absent { color: var(--muted); font-style: italic; overflow-wrap: anywhere; }
-table { border-collapse: collapse; width: 100%; font-size: .9rem; }
-td, th { text-align: left; padding: .45rem .8rem .45rem 0; vertical-align: top;
-  border-bottom: 1px solid var(--grid); }
-th { color: var(--muted); font-weight: 500; }
-td p { margin: .1rem 0 0; font-size: .84rem; }
-td.number { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
-td.number small { display: block; color: var(--muted); }
-summary { cursor: pointer; font-weight: 600; margin-top: 2.6rem; }
-code { font-size: .86em; }
-"""
-
-_PAGE = """\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-{style}</style>
-</head>
-<body>
-<main>
-<h1>{title}</h1>
-<p class="summary">{summary}</p>
-<div class="tiles">{tiles}</div>
-{figures}
-<section id="metrics"><h2>All metrics</h2>
-<table><tr><th>metric</th><th>value</th><th>unit</th></tr>{table}</table></section>
-<details><summary>Topics in the bag</summary>
-<table><tr><th>topic</th><th>type</th><th>messages</th></tr>{topics}</table></details>
-</main>
-</body>
-</html>
-"""
+            f'@media (prefers-color-scheme: dark) {{ :root {{ {variables(1)} }} }}')

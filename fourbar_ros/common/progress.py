@@ -12,6 +12,11 @@ Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 """Wraps an iterable of known length; a progress bar, or nothing."""
 
 
+def no_progress(items: Iterable[Any], total: int) -> Iterable[Any]:
+    """Return the iterable itself: a :data:`Progress` without a progress bar."""
+    return items
+
+
 def show_note(shown: Iterable[Any], text: str) -> None:
     """Show a note beside the progress bar, if there is one."""
     set_note = getattr(shown, 'set_postfix_str', None)

@@ -1,4 +1,4 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The look of the figures."""
+"""Style and helpers of all figures."""

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The look of the figures: colours for light and dark paper, SVG that sits in an HTML page.
+Style of the figures: colours for light and dark backgrounds, SVG for embedding in an HTML page.
 
-Figures are drawn in the light colours; each colour becomes a CSS variable of the page, so that
-one file reads well on both.
+Figures use the light colours. In SVG for a page each colour becomes a CSS variable, so that one
+file is legible on a light and on a dark background.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import io
 import re
 from typing import Any, ParamSpec
 
-from fourbar_ros.analysis.bags import Floats
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -24,8 +23,9 @@ from matplotlib.ticker import LogLocator, NullLocator
 import numpy as np
 from numpy.typing import NDArray
 
-# Name: (on light, on dark). The four links are distinct to colour-blind eyes (after Okabe and
-# Ito), and the dashes below keep them apart where curves coincide.
+Floats = NDArray[np.float64]
+
+# Colour by name: (on light, on dark). The link colours follow Okabe and Ito (colour-blind).
 PALETTE = {
     'paper': ('#ffffff', '#16181c'),
     'ink': ('#1b1e23', '#e9ebee'),
@@ -38,18 +38,29 @@ PALETTE = {
     'link_d': ('#9b3a8f', '#e39ad9'),
     'limit': ('#b3261e', '#ff8a80'),
 }
+
 COLOURS = {name: light for name, (light, _) in PALETTE.items()}
-LINK_COLOURS = tuple(COLOURS[f'link_{letter}'] for letter in 'abcd')
-# Opposite links carry the same curve in a parallelogram: dashes over the solid line show both.
+LETTERS = 'abcd'
+LINK_COLOURS = tuple(COLOURS[f'link_{letter}'] for letter in LETTERS)
+# Line styles; in a parallelogram the dashed curves of c and d cover those of a and b.
 LINK_DASHES = ('-', '-', (0, (4, 3)), (0, (4, 3)))
 
+# Width of every figure [in].
 WIDTH_IN = 10.0
-# Resolution of PNG files [dots per inch].
+# Resolution of raster images.
 DPI = 120
-# Two points a bin: about one bin for each pixel of a panel.
+# Bins of a decimated curve: about one for each pixel of a panel.
 BINS = 450
 
-# The look of every figure, for `matplotlib.rc_context`.
+# Line style of limits and goals.
+DASHED = (0, (6, 2))
+# Style of scattered samples.
+SAMPLES: dict[str, Any] = {
+    'linestyle': 'none', 'marker': '.', 'markersize': 3.5, 'markeredgewidth': 0}
+# Averaging time of NIS [s].
+NIS_WINDOW_S = 1.0
+
+# Parameters of every figure, for `matplotlib.rc_context`.
 RC: dict[Any, Any] = {
     'font.size': 9.0,
     'axes.titlesize': 9.5,
@@ -87,11 +98,25 @@ RC: dict[Any, Any] = {
 }
 
 
-def draw(make: Callable[[], Figure], salt: str) -> str:
+def render(make: Callable[[], Figure], kind: str, salt: str = 'figure') -> bytes:
     """
-    Make a figure in this style and return it as an SVG element.
+    Draw a figure in this style on a light background; the same figure gives the same bytes.
 
-    :param salt: makes the identifiers of this figure different from those of its neighbours.
+    :param kind: `png` or `svg`.
+    :param salt: seed of the identifiers in an SVG.
+    """
+    with rc_context({**RC, 'svg.hashsalt': salt}):
+        buffer = io.BytesIO()
+        make().savefig(buffer, format=kind, dpi=DPI, facecolor=COLOURS['paper'],
+                       metadata={'Date': None} if kind == 'svg' else None)
+    return buffer.getvalue()
+
+
+def page_svg(make: Callable[[], Figure], salt: str) -> str:
+    """
+    Draw a figure in this style as an SVG element for an HTML page.
+
+    :param salt: keeps the identifiers of this figure apart from those of other figures.
     """
     with rc_context({**RC, 'svg.hashsalt': salt}):
         buffer = io.StringIO()
@@ -106,7 +131,7 @@ def _for_page(svg: str, salt: str) -> str:
                  rf'<svg viewBox="\1" role="img" aria-label="{salt}" '
                  'xmlns:xlink="http://www.w3.org/1999/xlink">', svg, count=1)
     svg = re.sub(r'<g id="[^"]*"', '<g', svg)
-    # A hundredth of a point is beyond any screen; the digits behind it are half the file.
+    # A hundredth of a point is below the resolution of screens; further digits double the size.
     svg = re.sub(r'(\d\.\d\d)\d+', r'\1', svg)
     for name, colour in COLOURS.items():
         svg = svg.replace(colour, f'var(--{name.replace("_", "-")})')
@@ -117,22 +142,18 @@ Arguments = ParamSpec('Arguments')
 
 
 def as_png(make: Callable[Arguments, Figure]) -> Callable[Arguments, bytes]:
-    """Decorate a function that makes a figure: it draws in this style and returns a PNG file."""
+    """Decorate a function that makes a figure; the decorated function returns a PNG image."""
     @wraps(make)
     def draw_png(*args: Arguments.args, **kwargs: Arguments.kwargs) -> bytes:
-        with rc_context(RC):
-            buffer = io.BytesIO()
-            make(*args, **kwargs).savefig(
-                buffer, format='png', dpi=DPI, facecolor=COLOURS['paper'])
-            return buffer.getvalue()
+        return render(lambda: make(*args, **kwargs), 'png')
     return draw_png
 
 
 def panels(height: float, rows: int, columns: int, **options: Any) -> tuple[Figure, Any]:
     """
-    Make a figure of the full width with a grid of axes.
+    Return a figure of the full width with a grid of axes.
 
-    :param height: [inch].
+    :param height: [in].
     :param options: for `Figure.subplots`.
     :returns: the figure and its axes, as `Figure.subplots` returns them.
     """
@@ -142,10 +163,11 @@ def panels(height: float, rows: int, columns: int, **options: Any) -> tuple[Figu
 
 def decimate(x: Floats, y: Floats, bins: int = BINS) -> tuple[Floats, Floats]:
     """
-    Thin out a curve to its smallest and largest value in each bin, so that no peak is lost.
+    Reduce a curve to its smallest and largest value in each bin, so that no peak is lost.
 
-    :param x: (n,) ascending; NaN in y is left out.
-    :returns: at most 2 bins points, in order.
+    :param x: (n,) ascending.
+    :param y: (n,); NaN is left out.
+    :returns: at most 2 * bins points, in order.
     """
     known = np.isfinite(y)
     x, y = x[known], y[known]
@@ -160,10 +182,11 @@ def decimate(x: Floats, y: Floats, bins: int = BINS) -> tuple[Floats, Floats]:
 
 def thin_out(x: Floats, y: Floats, count: int) -> tuple[Floats, Floats]:
     """
-    Thin out scattered samples evenly, so that their density stays, and keep the extremes.
+    Reduce scattered samples evenly, so that their density stays, and keep the extremes.
 
-    :param x: (n,) ascending; NaN in y is left out.
-    :returns: about count points, in order.
+    :param x: (n,) ascending.
+    :param y: (n,); NaN is left out.
+    :returns: about `count` points, in order.
     """
     known = np.isfinite(y)
     x, y = x[known], y[known]
@@ -175,16 +198,38 @@ def thin_out(x: Floats, y: Floats, count: int) -> tuple[Floats, Floats]:
 
 
 def si_scale(largest: float) -> tuple[float, str]:
-    """Return the factor and the prefix with which a number up to this reads well."""
+    """Return the factor and the SI prefix with which the largest value is at least 1."""
     for factor, prefix in ((1.0, ''), (1e3, 'm'), (1e6, 'µ'), (1e9, 'n')):
         if largest * factor >= 1.0:
             return factor, prefix
     return 1.0, ''
 
 
+def link_title(axes: Axes, link: int) -> None:
+    """Set the title of a panel that shows one link, in the colour of the link."""
+    axes.set_title(f'link {LETTERS[link]}', color=LINK_COLOURS[link], fontweight='bold')
+
+
+def windowed_nis(time: Floats, nis: Floats, degrees: Floats) -> tuple[Floats, Floats, Floats]:
+    """
+    Average NIS over windows of `NIS_WINDOW_S`; a shorter last window is joined to the one before.
+
+    :param time: (n,) ascending [s].
+    :param nis: (n,) normalized innovation squared.
+    :param degrees: (n,) degrees of freedom.
+    :returns: mean time [s], NIS per degree of freedom, and degrees of freedom of each window.
+    """
+    window = ((time - time[0]) // NIS_WINDOW_S).astype(int)
+    window = np.minimum(window, max(int(window[-1]) - 1, 0))
+    total: Floats = np.bincount(window, degrees).astype(np.float64)
+    used = total > 0
+    centre = np.bincount(window, time)[used] / np.bincount(window)[used]
+    return centre, np.bincount(window, nis)[used] / total[used], total[used]
+
+
 def label_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
     """
-    Write names at the right end of curves, moved apart where curves end together.
+    Write labels at the right end of curves, moved apart where curves end close together.
 
     :param ends: (last y, text, colour) of each curve.
     """
@@ -202,7 +247,7 @@ def label_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
 
 
 def legend_above(axes: Axes, markerscale: float = 1.0) -> None:
-    """Put the legend beside the title, where it hides no curve."""
+    """Put the legend above the axes, where it covers no curve."""
     labels = axes.get_legend_handles_labels()[1]
     axes.legend(loc='lower right', bbox_to_anchor=(1.0, 1.0), ncols=len(labels),
                 borderaxespad=0.1, markerscale=markerscale)

@@ -4,20 +4,9 @@
 """The bags of known motions, for the tests of this folder."""
 
 from dataclasses import replace
-from importlib.util import module_from_spec, spec_from_file_location
-from pathlib import Path
 
 from fourbar_ros.loop import load_scenario
 import pytest
-
-
-@pytest.fixture(scope='session')
-def synthetic():
-    """Return the module that writes bags (tests are no package: it cannot be imported)."""
-    spec = spec_from_file_location('synthetic', Path(__file__).with_name('synthetic.py'))
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope='session')

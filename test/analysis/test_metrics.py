@@ -5,9 +5,10 @@
 
 import json
 
-from fourbar_ros.analysis.bags import BagError, read_bag
-from fourbar_ros.analysis.manoeuvre import find_motion
-from fourbar_ros.analysis.metrics import MEANINGS, metrics
+from fourbar_ros.analysis.bag_reader import BagError
+from fourbar_ros.analysis.bags import read_bag
+from fourbar_ros.analysis.manoeuvre import find_manoeuvre
+from fourbar_ros.analysis.metrics import compute_metrics, METRICS
 from fourbar_ros.mechanism import Mechanism
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ PAPER = Mechanism(
 
 @pytest.fixture(scope='module')
 def result(motion_bag):
-    return metrics(read_bag(motion_bag), PAPER)
+    return compute_metrics(read_bag(motion_bag), PAPER)
 
 
 @pytest.fixture
@@ -36,7 +37,7 @@ def test_every_metric_is_there_and_goes_through_json(result):
     assert result['missing'] == {}
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     assert {f'{group}.{key}' for group in result if group not in ('motion', 'missing')
-            for key in result[group]} == set(MEANINGS)
+            for key in result[group]} == set(METRICS)
 
 
 def test_motion_begins_at_the_tick_of_the_setpoint(result, synthetic):
@@ -112,7 +113,7 @@ def test_namespace_and_recorder_time_change_nothing(synthetic, tmp_path, result)
     messages = synthetic.motion_messages(namespace='/lab')
     for entries in messages.values():
         entries[:] = [(20 * received_ns % 2**62, message) for received_ns, message in entries]
-    other = metrics(read_bag(synthetic.write_bag(tmp_path / 'bag', messages)), PAPER)
+    other = compute_metrics(read_bag(synthetic.write_bag(tmp_path / 'bag', messages)), PAPER)
     assert other == result
 
 
@@ -121,7 +122,7 @@ def test_whole_turns_between_topics_change_nothing(motion_with, result):
         for number, name in ((1, '/estimate/link_states'), (-2, '/reference')):
             for _, message in messages[name]:
                 message.position += 2 * np.pi * number
-    turned = metrics(motion_with(turn), PAPER)
+    turned = compute_metrics(motion_with(turn), PAPER)
     for group in ('tracking', 'estimate'):
         assert turned[group] == pytest.approx(result[group], rel=1e-9)
 
@@ -130,7 +131,7 @@ def test_late_recorder_does_not_shift_the_start(motion_with, synthetic):
     def delay(messages):
         received_ns, setpoint = messages['/setpoint'][0]
         messages['/setpoint'] = [(received_ns + 20_000_000, setpoint)]  # 20 ticks late
-    assert find_motion(motion_with(delay)).start_ns == synthetic.START_NS
+    assert find_manoeuvre(motion_with(delay)).start_ns == synthetic.START_NS
 
 
 def test_refused_setpoint_is_not_the_one_that_was_followed(motion_with, synthetic):
@@ -139,7 +140,7 @@ def test_refused_setpoint_is_not_the_one_that_was_followed(motion_with, syntheti
         for later, goal in ((1_000_000_000, [1.0, np.nan]), (600_000_000, [-2.0, 1.0])):
             messages['/setpoint'].append(
                 (received_ns + later, synthetic.joint_state(0, ['link_a', 'link_b'], goal)))
-    motion = find_motion(motion_with(refuse))
+    motion = find_manoeuvre(motion_with(refuse))
     assert (motion.setpoint_number, motion.setpoint_count) == (1, 3)
     assert motion.start_ns == synthetic.START_NS
 
@@ -151,7 +152,7 @@ def test_goal_of_a_link_without_setpoint_is_what_the_reference_holds(motion_with
             0, ['link_a'], [synthetic.TURN_RAD]))]
         for _, message in messages['/reference']:
             message.position[[1, 3]] = 1.25
-    goal = find_motion(motion_with(hold)).goal
+    goal = find_manoeuvre(motion_with(hold)).goal
     assert goal[:2] == pytest.approx([synthetic.TURN_RAD, 1.25])
 
 
@@ -163,7 +164,7 @@ def test_setpoint_where_the_linkage_is_already(motion_with, synthetic):
         for _, message in messages['/reference']:
             message.position[:] = synthetic.INITIAL_RAD
             message.velocity[:] = 0.0
-    motion = find_motion(motion_with(rest))
+    motion = find_manoeuvre(motion_with(rest))
     assert motion.start_ns == synthetic.START_NS
 
 
@@ -175,16 +176,16 @@ def test_disarming_ends_the_motion(motion_with, synthetic):
             stamp = message.header.stamp
             if stamp.sec * 10**9 + stamp.nanosec > disarmed_ns:
                 message.position += 0.1
-    assert find_motion(motion_with(disarm)).end_ns == disarmed_ns
+    assert find_manoeuvre(motion_with(disarm)).end_ns == disarmed_ns
 
 
 def test_recording_that_ends_early_has_no_final_error(motion_with, synthetic):
     def cut(messages):
         for name, entries in messages.items():
             messages[name] = entries[:300]
-    result = metrics(motion_with(cut), PAPER)
+    result = compute_metrics(motion_with(cut), PAPER)
     assert not result['motion']['complete']
-    assert 'ends before the step' in result['missing']['tracking.final_error_rad']
+    assert 'tracking.final_error_rad' in result['missing']
     assert result['tracking']['rms_rad'] > 0
 
 
@@ -197,16 +198,16 @@ def test_recording_that_ends_early_has_no_final_error(motion_with, synthetic):
                              'flywheel.final_energy_j'}),
     ('estimate/sigma', {'estimate.within_2_sigma'}),
     ('estimate/innovation', {'estimate.mean_nis_per_degree_of_freedom'}),
-    ('timing', {name for name in MEANINGS if name.startswith('loop.')}),
-    ('energy', {name for name in MEANINGS if name.startswith('energy.')}),
+    ('timing', {name for name in METRICS if name.startswith('loop.')}),
+    ('energy', {name for name in METRICS if name.startswith('energy.')}),
     ('controller_status', set()),
 ])
 def test_optional_topic_costs_its_metrics_and_no_other(motion_with, result, topic, lost):
     def leave_out(messages):
         del messages[f'/{topic}']
-    poorer = metrics(motion_with(leave_out), PAPER)
+    poorer = compute_metrics(motion_with(leave_out), PAPER)
     assert set(poorer['missing']) == lost
-    for name in set(MEANINGS) - lost:
+    for name in set(METRICS) - lost:
         group, key = name.split('.')
         assert poorer[group][key] == result[group][key]
 
@@ -216,37 +217,37 @@ def test_recording_from_before_copper_losses_were_told_lacks_nothing_else(motion
         for _, message in messages['/energy']:
             del message.name[-1]
             message.position = message.position[:-1]
-    poorer = metrics(motion_with(older), PAPER)
+    poorer = compute_metrics(motion_with(older), PAPER)
     assert set(poorer['missing']) == {'energy.copper_loss_j'}
     assert poorer['energy']['work_j'] == result['energy']['work_j']
 
 
 @pytest.mark.parametrize(
     'topic', ['setpoint', 'reference', 'estimate/link_states', 'flywheel_states'])
-def test_essential_topic_is_asked_for_by_name(motion_with, topic):
+def test_missing_essential_topic_is_named(motion_with, refuses, topic):
     def leave_out(messages):
         del messages[f'/{topic}']
-    with pytest.raises(BagError, match=f'no topic {topic}'):
-        metrics(motion_with(leave_out), PAPER)
+    with refuses(BagError, reason='no_topic', topic=topic):
+        compute_metrics(motion_with(leave_out), PAPER)
 
 
-def test_setpoint_that_nobody_followed_is_an_error(motion_with, synthetic):
+def test_setpoint_without_response_is_an_error(motion_with, synthetic, refuses):
     rng = np.random.default_rng(3)
 
     def disarmed(messages):
         for _, message in messages['/reference']:
             message.position[:] = synthetic.INITIAL_RAD + 1e-3 * rng.standard_normal(4)
-    with pytest.raises(BagError, match='followed no setpoint'):
-        metrics(motion_with(disarmed), PAPER)
+    with refuses(BagError, reason='no_data', topic='setpoint'):
+        compute_metrics(motion_with(disarmed), PAPER)
 
 
 def test_ticks_that_the_recorder_missed_are_counted(motion_with):
     def thin(messages):
         del messages['/timing'][300:303]
-    loop = metrics(motion_with(thin), PAPER)['loop']
+    loop = compute_metrics(motion_with(thin), PAPER)['loop']
     assert (loop['unrecorded_ticks'], loop['ticks']) == (3, 598)
 
 
 def test_without_mechanism_only_the_energy_is_missing(motion_bag):
-    missing = metrics(read_bag(motion_bag))['missing']
+    missing = compute_metrics(read_bag(motion_bag))['missing']
     assert set(missing) == {'flywheel.peak_energy_j', 'flywheel.final_energy_j'}

@@ -9,7 +9,8 @@ import re
 from xml.etree import ElementTree
 
 from fourbar_ros.analysis import report
-from fourbar_ros.common.errors import FourbarError
+from fourbar_ros.common.config_files import ConfigurationError
+from fourbar_ros.common.output_files import OutputError
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.plotting import style
 import numpy as np
@@ -61,7 +62,7 @@ def test_identifiers_are_unique_and_found(written):
     assert set(used) <= set(defined)
 
 
-def test_every_colour_has_a_dark_twin(written):
+def test_every_colour_has_a_dark_variant(written):
     page = written[1]
     sheet, body = page.split('</style>', 1)
     light, dark = sheet.split('prefers-color-scheme: dark')
@@ -135,7 +136,7 @@ def test_thinning_keeps_every_peak(thin):
     (['estimate/sigma', 'link_angles', 'controller_status'], set()),
     (['sim/link_states', 'sim/flywheel_states', 'energy'], {'energy'}),
 ])
-def test_what_is_missing_is_said_in_a_sentence(synthetic, tmp_path, topics, absent):
+def test_missing_data_is_named_in_the_page(synthetic, tmp_path, topics, absent):
     messages = synthetic.motion_messages()
     for topic in topics:
         del messages[f'/{topic}']
@@ -159,15 +160,15 @@ def test_motion_backwards_short_and_cut(synthetic, tmp_path):
     assert list(figures((tmp_path / 'r.html').read_text())) == NAMES
 
 
-def test_unknown_mechanism_in_the_bag_is_no_obstacle_but_one_asked_for_is(synthetic, tmp_path):
+def test_unknown_mechanism_of_the_bag_is_ignored_and_of_the_caller_refused(synthetic, tmp_path):
     bag = synthetic.write_bag(
         tmp_path / 'bag', synthetic.motion_messages(mechanism='/gone/my.yaml'))
     files = tmp_path / 'r.html', tmp_path / 'm.json'
     assert 'flywheel.peak_energy_j' in report.write_report(bag, *files)['missing']
-    with pytest.raises(FourbarError, match='nowhere'):
+    with pytest.raises(ConfigurationError):
         report.write_report(bag, *files, 'nowhere')
 
 
 def test_output_that_cannot_be_written_is_an_error(motion_bag, tmp_path):
-    with pytest.raises(FourbarError, match='cannot write'):
+    with pytest.raises(OutputError):
         report.write_report(motion_bag, tmp_path / 'no' / 'r.html', tmp_path / 'm.json', PAPER)

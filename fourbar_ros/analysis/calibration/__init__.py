@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Calibration of a device from what it recorded: arrays in, estimates with intervals out.
+Parameter identification from recorded measurements: arrays in, estimates with intervals out.
 
-Zeros of the link encoders from a known pose, wheels from spin-ups and coast-downs, links from an
-excitation of all four. No ROS, no files.
+Offsets of the link encoders from a known pose, wheel parameters from spin-ups and coast-downs,
+link parameters from a multi-sine excitation of all wheels. No ROS, no files.
 """

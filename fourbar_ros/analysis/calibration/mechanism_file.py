@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Mechanism files as text, with what was calibrated and when."""
+"""Write mechanism files, with notes on the calibrations behind their values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ KEYS = {
     'link_masses': 'kg, flywheel included',
     'link_inertias': "kg m^2, about the mass centre, without the wheel's axial inertia",
     'com_positions': "m, in the link's frame",
-    'link_angle_offsets': 'rad, what the sensors read beyond the truth',
+    'link_angle_offsets': 'rad, encoder reading minus true angle',
     'flywheel_inertias': 'kg m^2, axial',
     'motor_torque_limits': 'N m',
     'motor_speed_limits': 'rad/s, relative to the link',
@@ -32,29 +32,31 @@ KEYS = {
 
 def mechanism_text(mechanism: Mechanism, notes: Sequence[str]) -> str:
     """
-    Write all keys of a mechanism, numbers to the last bit.
+    Return a mechanism file with all keys; numbers keep every bit.
 
-    :param notes: what was calibrated, one line each, the oldest first.
+    :param notes: one line for each calibration, the oldest first.
     """
     lines = [f'{NOTE}{note}' for note in notes]
-    for key, meaning in KEYS.items():
-        rows = np.asarray(getattr(mechanism, key)).tolist()
-        lines.append(f'{key}: {_text(rows)}  # {meaning}')
+    lines += [f'{key}: {_text(np.asarray(getattr(mechanism, key)).tolist())}  # {meaning}'
+              for key, meaning in KEYS.items()]
     return '\n'.join(lines) + '\n'
 
 
-def notes_of(path: Path) -> list[str]:
-    """Return what a mechanism file says of earlier calibrations."""
+def calibration_notes(path: Path) -> list[str]:
+    """Return the notes of earlier calibrations in a mechanism file."""
     return [line[len(NOTE):] for line in path.read_text(encoding='utf-8').splitlines()
             if line.startswith(NOTE)]
+
+
+def yaml_number(text: str) -> str:
+    """Return a number as YAML 1.1 reads it: `.inf`, and with a decimal point."""
+    if 'inf' in text:
+        return text.replace('inf', '.inf')
+    mantissa, mark, exponent = text.partition('e')
+    return f'{mantissa}{"" if "." in mantissa else ".0"}{mark}{exponent}'
 
 
 def _text(value: object) -> str:
     if isinstance(value, list):
         return f'[{", ".join(map(_text, value))}]'
-    # As YAML 1.1 has it: infinity with a point, and no exponent without one.
-    text = repr(value)
-    if 'inf' in text:
-        return text.replace('inf', '.inf')
-    mantissa, mark, exponent = text.partition('e')
-    return f'{mantissa}{"" if "." in mantissa or not mark else ".0"}{mark}{exponent}'
+    return yaml_number(repr(value))

@@ -10,7 +10,11 @@ from dataclasses import replace
 from typing import Any
 
 from fourbar_ros.analysis.calibration.excitation import Excitation
-from fourbar_ros.analysis.calibration.signals import link_signal, LinkSignal, WheelSignal
+from fourbar_ros.analysis.calibration.measurements import (
+    link_measurements,
+    LinkMeasurements,
+    WheelMeasurements,
+)
 from fourbar_ros.device.command import drive_by_name
 from fourbar_ros.device.interface import no_torque
 from fourbar_ros.device.simulated import SimulatedTable
@@ -22,7 +26,7 @@ import pytest
 PERIOD_NS = 4_000_000
 BEGIN_NS = 1_000_000_000
 
-Excited = Callable[..., tuple[LinkSignal, WheelSignal]]
+Excited = Callable[..., tuple[LinkMeasurements, WheelMeasurements]]
 
 
 @pytest.fixture(scope='session')
@@ -89,12 +93,12 @@ class Bed:
             self._drive = drive_by_name(list(asked), (), (), list(asked.values()))
             self.tick()
 
-    def recorded(self) -> tuple[LinkSignal, WheelSignal]:
+    def recorded(self) -> tuple[LinkMeasurements, WheelMeasurements]:
         """Return what a bag would hold."""
         stamps, angles = zip(*self._links)
         ticks, wheels = zip(*self._wheels)
-        return (link_signal(np.array(stamps), np.array(angles), BEGIN_NS),
-                WheelSignal((np.array(ticks) - BEGIN_NS) * 1e-9, *(
+        return (link_measurements(np.array(stamps), np.array(angles), BEGIN_NS),
+                WheelMeasurements((np.array(ticks) - BEGIN_NS) * 1e-9, *(
                     np.array([getattr(sample, name) for sample in wheels])
                     for name in ('angles', 'speeds', 'efforts'))))
 
@@ -103,7 +107,7 @@ class Bed:
 def excited() -> Excited:
     """Return a function that records an excitation: links and wheels."""
     def run(mechanism: Mechanism, table: Table, excitation: Excitation, seed: int,
-            initial: InitialState | None = None) -> tuple[LinkSignal, WheelSignal]:
+            initial: InitialState | None = None) -> tuple[LinkMeasurements, WheelMeasurements]:
         bed = Bed(mechanism, table, seed, initial or InitialState())
         bed.follow(excitation)
         return bed.recorded()
