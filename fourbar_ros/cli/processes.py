@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Child processes that never outlive their parent and are stopped in order."""
+"""Child processes that end with their parent and are stopped in order."""
 
 from __future__ import annotations
 
@@ -18,36 +18,35 @@ from types import TracebackType
 import fourbar_ros
 from fourbar_ros.common.errors import FourbarError
 
-# From <sys/prctl.h>: ask the kernel for a signal when the parent dies, however it dies.
+# From <sys/prctl.h>: the kernel sends a signal when the parent ends in any way.
 PR_SET_PDEATHSIG = 1
-
-# How long a process may take to end after a signal [s].
-PATIENCE = 5.0
+# Time for a process to end after a signal, before the next stronger signal [s].
+SIGNAL_TIMEOUT_S = 5.0
 
 LIBC = ctypes.CDLL(None)
 
 
 class ProcessError(FourbarError):
-    """A child process that ended when it should not."""
+    """A child process ended early; `values` hold `name` and `value`, its exit code."""
 
 
 class Processes:
     """
-    Commands of this package in processes of their own; use as a context manager.
+    Commands of this package in child processes; use as a context manager.
 
-    They get their own process group, so that Ctrl-C reaches the parent alone and everything can
-    be stopped in order, and end with the parent even if it is killed.
+    Each child has its own session, so that Ctrl-C reaches the parent only and the children stop
+    in order. Children end with the parent, even if it is killed.
 
-    :param logs: folder for what they print, one file per process.
-    :param environment: of all of them.
+    :param logs: folder for the output of the children, one file each.
+    :param environment: of the children.
     """
 
     def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
         self._logs = logs
         self._environment = dict(environment)
         if not Path(fourbar_ros.__file__).parents[1].samefile(Path.cwd()):
-            # Or they would run the checkout that somebody stands in, instead of this package,
-            # and compile its kernels, each for itself. (Python 3.10 does not know it.)
+            # Otherwise a checkout in the current directory would hide this package, and each
+            # child would compile its kernels. (No effect in Python 3.10.)
             self._environment['PYTHONSAFEPATH'] = '1'
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
@@ -57,7 +56,7 @@ class Processes:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
-        """Stop whatever still runs, the first started last."""
+        """Stop all children in reverse order of their start."""
         for name in reversed(list(self._running)):
             self.stop(name)
 
@@ -71,31 +70,32 @@ class Processes:
 
     def check(self) -> None:
         """
-        Make sure that all still run.
+        Check that all children run.
 
-        :raises ProcessError: one ended, with the last line that it printed.
+        :raises ProcessError: a child ended; the message has the last line of its log.
         """
         for name, process in self._running.items():
             code = process.poll()
             if code is not None:
-                raise ProcessError(f'{name} ended with exit code {code}: {self._last_line(name)}')
+                raise ProcessError(f'{name} ended with exit code {code}: {self._last_line(name)}',
+                                   name=name, value=code)
 
     def stop(self, *names: str) -> None:
-        """Ask some to end, insist if they do not, and wait until they have."""
+        """Stop children by SIGINT, SIGTERM and SIGKILL in turn, and wait for their end."""
         processes = [self._running.pop(name) for name in names]
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
             for process in processes:
                 if process.poll() is None:
                     process.send_signal(number)
-            deadline = time.monotonic() + PATIENCE
+            deadline = time.monotonic() + SIGNAL_TIMEOUT_S
             for process in processes:
                 with suppress(subprocess.TimeoutExpired):
                     process.wait(max(0.0, deadline - time.monotonic()))
 
     def _last_line(self, name: str) -> str:
-        time.sleep(0.05)    # its last words may still be on their way
+        time.sleep(0.05)    # the log may be written after the end
         lines = (self._logs / f'{name}.log').read_text(errors='replace').strip().splitlines()
-        return lines[-1] if lines else 'it said nothing'
+        return lines[-1] if lines else 'no output'
 
 
 def _end_with_parent() -> None:

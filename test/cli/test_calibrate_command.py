@@ -3,11 +3,10 @@
 
 """`fourbar calibrate --bag` as it is typed: files whole or not at all, and what is refused."""
 
-from importlib.util import module_from_spec, spec_from_file_location
 import json
 from pathlib import Path
 
-from fourbar_ros.analysis.calibration.mechanism_file import mechanism_text, notes_of
+from fourbar_ros.analysis.calibration.mechanism_file import calibration_notes, mechanism_text
 from fourbar_ros.cli.main import main
 from fourbar_ros.common.config_files import load_yaml
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism, Mechanism
@@ -22,15 +21,6 @@ AT_POSE = ['encoders', '--bag', 'jig', '--pose', 'link_a=0', 'link_b=60deg']
 def calibrate(*arguments):
     """Run the command, and return its exit code."""
     return main(['calibrate', *arguments])
-
-
-@pytest.fixture(scope='module')
-def synthetic():
-    path = Path(__file__).parents[1] / 'analysis' / 'synthetic.py'
-    spec = spec_from_file_location('synthetic', path)
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture
@@ -61,7 +51,7 @@ def test_mechanism_file_has_the_offsets_and_all_else(jig, capsys):
     for key in load_yaml('new.yaml'):
         if key != 'link_angle_offsets':
             np.testing.assert_array_equal(getattr(after, key), getattr(before, key), err_msg=key)
-    note, = notes_of(Path('new.yaml'))
+    note, = calibration_notes(Path('new.yaml'))
     assert note.startswith('link_angle_offsets, ') and note.endswith(', from jig')
     found = json.loads(Path('found.json').read_text())
     assert found['quantities'][0]['value'] == after.link_angle_offsets[0]
@@ -75,45 +65,46 @@ def test_offsets_add_up_and_notes_stay(jig):
     first, second = (load_mechanism(name).link_angle_offsets
                      for name in ('first.yaml', 'second.yaml'))
     np.testing.assert_allclose(second, 2.0 * first, rtol=1e-12)
-    assert len(notes_of(Path('second.yaml'))) == 2
+    assert len(calibration_notes(Path('second.yaml'))) == 2
 
 
 def test_existing_file_stays_unless_forced(jig, capsys):
     Path('new.yaml').write_text('mine')
     assert calibrate(*AT_POSE, '-o', 'new.yaml') == 2
-    assert capsys.readouterr().err == (
-        'fourbar calibrate: new.yaml exists already: choose another name or give --force\n')
+    line, = capsys.readouterr().err.splitlines()
+    assert line.startswith('fourbar calibrate: new.yaml') and '--force' in line
     assert Path('new.yaml').read_text() == 'mine'
     assert calibrate(*AT_POSE, '-o', 'new.yaml', '--force') == 0
     assert load_mechanism('new.yaml').link_angle_offsets.any()
 
 
-@pytest.mark.parametrize(('arguments', 'complaint'), [
+@pytest.mark.parametrize(('arguments', 'named'), [
     (['encoders', '--bag', 'jig', '--pose', 'link_a=0', 'link_x=1'],
-     "unknown link 'link_x' in the pose (known are link_a, link_b, link_c, link_d)"),
+     'link_x'),
     (['encoders', '--bag', 'jig', '--pose', 'link_a=0'],
-     'the pose names 1 of the links, and two are needed at least'),
+     'pose'),
     (['encoders', '--bag', 'jig', '--pose', 'link_a=0', 'link_a=1'],
-     'link_a is named twice in the pose'),
+     'link_a'),
     (['encoders', '--bag', 'jig', '--pose', 'link_a=here', 'link_b=1'],
-     "cannot read 'link_a=here': write link_a=0.5 [rad] or link_a=30deg"),
+     "'link_a=here'"),
     (['encoders', '--bag', 'jig', '--pose', 'link_a=0', 'link_b=60deg', 'link_c=20deg'],
-     'the pose does not close the loop within 0.002 rad'),
-    ([*AT_POSE, '--mechanism', 'none'], "no mechanism 'none'"),
-    ([*AT_POSE, '-o', 'nowhere/new.yaml'], 'cannot write nowhere/new.yaml: no such folder'),
-    (['wheels', '--bag', 'jig'], 'jig: no wheel was driven and turned fast'),
+     '0.002 rad'),
+    ([*AT_POSE, '--mechanism', 'none'], "'none'"),
+    ([*AT_POSE, '-o', 'nowhere/new.yaml'], 'nowhere/new.yaml'),
+    (['wheels', '--bag', 'jig'], 'jig: no wheel'),
+    (['wheels', '--bag', 'jig', '--speed', '-1'], '--speed'),
     (['wheels', '--bag', 'jig', '--figure', 'fit.pdf'],
-     'cannot write fit.pdf: a picture is .png or .svg'),
-    (['links', '--bag', 'jig'], 'the links move for 0.0 s, and 8 s are needed at least'),
-    (['links', '--bag', 'none'], 'none: no such directory'),
-    (['wheels'], 'the wheels are going to turn: say so with --yes'),
+     'fit.pdf'),
+    (['links', '--bag', 'jig'], '8 s'),
+    (['links', '--bag', 'none'], 'none: '),
+    (['wheels'], '--yes'),
 ])
-def test_bad_input_is_one_line(jig, capsys, monkeypatch, arguments, complaint):
+def test_bad_input_is_one_line(jig, capsys, monkeypatch, arguments, named):
     monkeypatch.setattr('sys.stdin', Path('/dev/null').open())
     assert calibrate(*arguments) == 2
     error, = capsys.readouterr().err.splitlines()
     assert error.startswith('fourbar calibrate: ')
-    assert complaint in error
+    assert named in error
     assert [path.name for path in jig.iterdir()] == ['jig']
 
 
@@ -124,7 +115,9 @@ def test_bag_without_the_topics_is_refused(synthetic, tmp_path, capsys, monkeypa
         '/device_status': [(1, synthetic.status(state='disarmed', mechanism='prototype'))]})
     pose = ['--pose', 'link_a=0', 'link_b=1'] if kind == 'encoders' else []
     assert calibrate(kind, '--bag', 'other', *pose) == 2
-    assert 'no topic ' in capsys.readouterr().err
+    line, = capsys.readouterr().err.splitlines()
+    assert 'other: ' in line
+    assert 'link_angles' in line or 'flywheel_states' in line
 
 
 def test_joint_encoders_are_refused(synthetic, tmp_path, capsys):
@@ -135,7 +128,8 @@ def test_joint_encoders_are_refused(synthetic, tmp_path, capsys):
         '/link_angles': [(stamp, synthetic.joint_state(stamp, names, np.zeros(5)))
                          for stamp in stamps]})
     assert calibrate('encoders', '--bag', str(bag), '--pose', 'link_a=0', 'link_b=1') == 2
-    assert 'only a device with an absolute sensor on each link' in capsys.readouterr().err
+    line, = capsys.readouterr().err.splitlines()
+    assert all(joint in line for joint in names[:4])
 
 
 @pytest.mark.parametrize('name', ['paper', 'prototype'])
@@ -146,4 +140,4 @@ def test_mechanism_file_keeps_every_bit(tmp_path, name):
     again = load_mechanism(str(path))
     for key in vars(Mechanism)['__dataclass_fields__']:
         np.testing.assert_array_equal(getattr(again, key), getattr(mechanism, key), err_msg=key)
-    assert notes_of(path) == ['once', 'twice']
+    assert calibration_notes(path) == ['once', 'twice']

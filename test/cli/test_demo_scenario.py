@@ -4,8 +4,9 @@
 """What the demo takes from a scenario, and which it refuses, without starting anything."""
 
 from pathlib import Path
+from typing import Any
 
-from fourbar_ros.cli.demo import _one_move, _write_parameters
+from fourbar_ros.cli.demo import load_one_move, write_parameters
 from fourbar_ros.common.config_files import share_directory
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.loop import load_scenario
@@ -20,8 +21,7 @@ def test_nodes_get_the_scenario_with_the_duration_of_its_setpoint(
 ) -> None:
     scenario = load_scenario(name)
     path = tmp_path / 'parameters.yaml'
-    assert _write_parameters(scenario, 'simulated', path) == [
-        '--ros-args', '--params-file', str(path)]
+    write_parameters(scenario, 'simulated', path)
     written = {key.removeprefix('/**/'): section['ros__parameters']
                for key, section in yaml.safe_load(path.read_text()).items()}
     wanted = scenario.parameters()
@@ -31,27 +31,27 @@ def test_nodes_get_the_scenario_with_the_duration_of_its_setpoint(
     assert written == wanted
 
 
-def test_estimator_and_controller_get_the_model(tmp_path: Path) -> None:
+def test_estimator_and_controller_get_the_model_mechanism(tmp_path: Path) -> None:
     content = yaml.safe_load((share_directory() / 'config' / 'scenario_paper.yaml').read_text())
     heavy = (share_directory() / 'config' / 'mechanism_paper.yaml').read_text().replace(
         '3.4e-7', '4.0e-7')
     (tmp_path / 'heavy.yaml').write_text(heavy)
     (tmp_path / 'mine.yaml').write_text(yaml.safe_dump({**content, 'model': './heavy.yaml'}))
-    _write_parameters(
-        _one_move(str(tmp_path / 'mine.yaml')), 'simulated', tmp_path / 'parameters.yaml')
+    write_parameters(
+        load_one_move(str(tmp_path / 'mine.yaml')), 'simulated', tmp_path / 'parameters.yaml')
     written = yaml.safe_load((tmp_path / 'parameters.yaml').read_text())
     assert {key: section['ros__parameters']['mechanism'] for key, section in written.items()} == {
         '/**/plant': 'paper', '/**/estimator': str(tmp_path / 'heavy.yaml'),
         '/**/controller': str(tmp_path / 'heavy.yaml')}
 
 
-@pytest.mark.parametrize(('preset', 'told'), [
-    ('papre', 'available are paper, prototype'), ('./none.yaml', 'no such file'),
-    ('./twice.yaml', 'this scenario has 2 setpoints'),
-    ('./still.yaml', 'this scenario has 0 setpoints'),
-    ('./wrong.yaml', 'seed must be a whole number')])
-def test_scenario_that_is_no_demo_is_refused_in_one_line(
-    preset: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(('preset', 'expected'), [
+    ('papre', {}), ('./none.yaml', {}),
+    ('./twice.yaml', {'name': 'setpoints', 'value': 2}),
+    ('./still.yaml', {'name': 'setpoints', 'value': 0}),
+    ('./wrong.yaml', {})])
+def test_scenario_without_exactly_one_setpoint_is_refused(
+    preset: str, expected: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     content = yaml.safe_load((share_directory() / 'config' / 'scenario_paper.yaml').read_text())
@@ -60,15 +60,16 @@ def test_scenario_that_is_no_demo_is_refused_in_one_line(
                          ('still', {'setpoints': []}), ('wrong', {'seed': 'x'})):
         Path(f'{name}.yaml').write_text(yaml.safe_dump({**content, **change}))
     with pytest.raises(FourbarError) as caught:
-        _one_move(preset)
-    assert told in str(caught.value)
+        load_one_move(preset)
+    assert {name: caught.value.values.get(name) for name in expected} == expected
     assert '\n' not in str(caught.value)
+    assert preset.strip('./') in str(caught.value) or 'seed' in str(caught.value)
 
 
 def test_on_a_bus_the_parameters_of_the_plant_are_shared_out(tmp_path: Path) -> None:
     """Each has what its table lists, and the two ends of the bus find each other."""
     path = tmp_path / 'parameters.yaml'
-    _write_parameters(_one_move('prototype'), 'prototype', path)
+    write_parameters(load_one_move('prototype'), 'prototype', path)
     written = {key.rpartition('/')[2]: values['ros__parameters']
                for key, values in yaml.safe_load(path.read_text()).items()}
     assert set(written) == {'prototype_emulator', 'hardware', 'estimator', 'controller'}

@@ -84,7 +84,7 @@ def test_interrupt_is_one_line_and_code_130(stub, capsys):
     assert capsys.readouterr().err == 'fourbar demo: interrupted\n'
 
 
-def test_reader_that_goes_away_is_no_outcry():
+def test_end_of_the_reader_of_stdout_prints_nothing():
     code = ('from fourbar_ros.cli import main; from types import SimpleNamespace\n'
             'def run(args):\n'
             '    for _ in range(100000): print("a line")\n'

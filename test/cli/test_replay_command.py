@@ -4,7 +4,6 @@
 """`fourbar replay` as it is typed."""
 
 from dataclasses import replace
-from importlib.util import module_from_spec, spec_from_file_location
 import json
 from pathlib import Path
 import shutil
@@ -16,15 +15,6 @@ from fourbar_ros.estimation import EstimatorSettings
 from fourbar_ros.estimation.estimator_settings import SETTINGS
 from fourbar_ros.loop import load_scenario
 import pytest
-
-
-@pytest.fixture(scope='module')
-def synthetic():
-    path = Path(__file__).parents[1] / 'analysis' / 'synthetic.py'
-    spec = spec_from_file_location('synthetic', path)
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope='module')
@@ -61,7 +51,7 @@ def test_all_files_are_beside_the_bag(bag, capsys):
     assert len(read_bag(new).joint_states('estimate/link_states')) > 250
 
 
-def test_settings_that_were_used_are_told(bag, capsys):
+def test_used_settings_are_printed(bag, capsys):
     assert main(['replay', bag, '-o', 'new', '--angle-noise', '0.004',
                  '--counts-per-turn', '4096', '--gate-probability', '1']) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
@@ -97,23 +87,23 @@ def test_every_setting_has_its_option(capsys):
         assert f'(default {row.default:g})' in text
 
 
-@pytest.mark.parametrize(('arguments', 'told'), [
-    (['nowhere'], 'nowhere: no such directory'),
-    (['run1', '-o', 'taken'], 'taken exists already'),
-    (['run1', '-o', 'run1/metadata.yaml/new'], 'is not a directory'),
-    (['run1', '--json', 'none/numbers.json'], 'no such folder'),
-    (['run1', '--angle-noise', '2'], 'angle_noise must be between 1e-09 and 1 rad, got 2'),
-    (['run1', '--angle-noise', 'much'], "angle_noise must be a number, got 'much'"),
-    (['run1', '--counts-per-turn', '1e4'], 'counts_per_turn must be of type int'),
-    (['run1', '--mechanism', 'papre'], 'available are paper, prototype'),
-    (['run1', '--namespace', 'lab'], 'nothing in the namespace /lab: there are /'),
-    (['run1', '--skip', '-1'], '--skip must be'),
-    (['run1', '--skip', '9'], 'skip less'),
-    (['run1', '--params-file', 'none.yaml'], 'none.yaml: No such file'),
-    (['run1', '--params-file', 'odd.yaml'], 'unknown setting angle_nose'),
-    (['run1', '--params-file', 'flat.yaml'], 'has no section ros__parameters'),
-    (['run1', '--params-file', 'others.yaml'], 'has no parameter of the node estimator')])
-def test_bad_input_is_one_line_and_leaves_nothing_behind(bag, capsys, arguments, told):
+@pytest.mark.parametrize(('arguments', 'named'), [
+    (['nowhere'], 'nowhere: '),
+    (['run1', '-o', 'taken'], 'taken '),
+    (['run1', '-o', 'run1/metadata.yaml/new'], 'run1/metadata.yaml/new'),
+    (['run1', '--json', 'none/numbers.json'], 'none/numbers.json'),
+    (['run1', '--angle-noise', '2'], 'angle_noise'),
+    (['run1', '--angle-noise', 'much'], "'much'"),
+    (['run1', '--counts-per-turn', '0.5'], 'counts_per_turn'),
+    (['run1', '--mechanism', 'papre'], 'papre'),
+    (['run1', '--namespace', 'lab'], 'namespace /lab'),
+    (['run1', '--skip', '-1'], '--skip'),
+    (['run1', '--skip', '9'], '--skip'),
+    (['run1', '--params-file', 'none.yaml'], 'none.yaml'),
+    (['run1', '--params-file', 'odd.yaml'], 'angle_nose'),
+    (['run1', '--params-file', 'flat.yaml'], 'ros__parameters'),
+    (['run1', '--params-file', 'others.yaml'], 'others.yaml')])
+def test_bad_input_is_one_line_and_leaves_nothing_behind(bag, capsys, arguments, named):
     Path('taken').mkdir()
     for name, text in (('odd', '/**/estimator: {ros__parameters: {angle_nose: 1.0}}'),
                        ('flat', 'estimator: {angle_noise: 1.0}'),
@@ -124,7 +114,7 @@ def test_bad_input_is_one_line_and_leaves_nothing_behind(bag, capsys, arguments,
     output, errors = capsys.readouterr()
     line, = errors.splitlines()
     assert line.startswith('fourbar replay: ')
-    assert told in line
+    assert named in line
     assert output == ''
     assert sorted(Path().iterdir()) == before
 

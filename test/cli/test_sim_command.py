@@ -10,7 +10,7 @@ import pytest
 
 
 @pytest.mark.parametrize('arguments', [[], ['dance'], ['pause', 'resume']])
-def test_what_cannot_be_read_is_refused(arguments, capsys):
+def test_bad_action_is_refused(arguments, capsys):
     with pytest.raises(SystemExit) as done:
         main(['sim', *arguments])
     assert done.value.code == 2
@@ -19,7 +19,7 @@ def test_what_cannot_be_read_is_refused(arguments, capsys):
     assert 'error: ' in captured.err.splitlines()[-1]
 
 
-def test_help_tells_the_four_actions(capsys):
+def test_help_describes_the_four_actions(capsys):
     with pytest.raises(SystemExit):
         main(['sim', '--help'])
     lines = capsys.readouterr().out.splitlines()

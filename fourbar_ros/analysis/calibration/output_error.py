@@ -23,8 +23,8 @@ from fourbar_ros.mechanism import LINK_NAMES, Mechanism, nearest_assembly
 from fourbar_ros.mechanism.constants import record
 from fourbar_ros.mechanism.dynamics import gamma_matrix
 from fourbar_ros.mechanism.forces import FIELDS, Surroundings
+from fourbar_ros.mechanism.integration import link_trajectories
 from fourbar_ros.mechanism.state import make_state
-from fourbar_ros.mechanism.tracks import link_tracks
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, make_lsq_spline
 
@@ -198,7 +198,7 @@ def simulate_links(windows: Sequence[Window], variants: Sequence[ModelParameters
         [variant.mechanism.flywheel_inertias for variant in variants], count, axis=0)
     steps = max(1, int(np.ceil(float(np.diff(windows[0].ticks).max()) / MAX_STEP_S - 1e-9)))
     period = float(np.ptp(windows[0].ticks)) / (len(windows[0].ticks) - 1)
-    track = link_tracks(
+    track = link_trajectories(
         states, np.array([window.accelerations for window in windows]),
         np.tile(np.arange(count), len(variants)), inertias, period / steps, steps, constants,
         around)
