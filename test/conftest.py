@@ -100,7 +100,7 @@ def momentum_and_energy() -> Callable[[Mechanism, Array, Array, Array], tuple[fl
 
 
 @contextmanager
-def _refused(kind: type[FourbarError], **values: Any
+def _refused(kind: type[FourbarError], /, **values: Any
              ) -> Iterator[pytest.ExceptionInfo[FourbarError]]:
     with pytest.raises(kind) as caught:
         yield caught

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Branches on which the links turn in two pairs, and where one meets another.
+Branches on which the links turn in two pairs, and the change points where two branches meet.
 
-Where opposite links are equally long, a turns with c and b with d: the parallelogram. Where all
-four are, there are two more. On the folded branch joint 4 lies on joint 2, and a turns with b and
-c with d; on the crossed branch joint 3 lies on joint 1, and a turns with d and b with c. Where all
-links are in line, two branches meet: the change points (docs/mechanics.md).
+If opposite links are equally long, a turns with c and b with d: the parallelogram. If all four
+links are equally long, there are two more branches. On the folded branch joint 4 lies on joint 2,
+and a turns with b and c with d; on the crossed branch joint 3 lies on joint 1, and a turns with d
+and b with c. Two branches meet where all links are in line: the change points
+(docs/mechanics.md).
 """
 
 from __future__ import annotations
@@ -33,47 +34,46 @@ class Branch:
     A branch on which the links turn in two pairs.
 
     :param name: of the branch.
-    :param pairs: of link indices; link a is first in the first.
-    :param apart: by how much the second link of each pair is turned against the first [rad].
-    :ivar twins: (4,) the same as kernels take it: first links of both pairs, then second links.
-    :ivar axes: first links of both pairs, after which the axes are named.
+    :param pairs: of link indices; link a is the first of the first pair.
+    :param pair_angle: of the second link of each pair, relative to the first [rad].
+    :ivar paired_links: (4,) for kernels: first links of both pairs, then second links.
     """
 
     name: str
     pairs: tuple[tuple[int, int], tuple[int, int]]
-    apart: float
-    twins: NDArray[np.int64] = field(init=False, repr=False, compare=False)
+    pair_angle: float
+    paired_links: NDArray[np.int64] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         (p1, p2), (q1, q2) = self.pairs
-        object.__setattr__(self, 'twins', np.array([p1, q1, p2, q2], dtype=np.int64))
+        object.__setattr__(self, 'paired_links', np.array([p1, q1, p2, q2], dtype=np.int64))
 
     @property
     def axes(self) -> list[int]:
-        """Return the first links of both pairs."""
+        """First links of both pairs, which the axes are named after."""
         return [self.pairs[0][0], self.pairs[1][0]]
 
     @property
     def followers(self) -> list[int]:
-        """Return the second links of both pairs."""
+        """Second links of both pairs."""
         return [self.pairs[0][1], self.pairs[1][1]]
 
     def axis_of(self, link: int) -> int:
-        """Return 0 or 1, the pair to which a link belongs."""
+        """Return the pair to which a link belongs, 0 or 1."""
         return int(link in self.pairs[1])
 
     def offsets(self, angles: Array) -> Array:
         """
-        Work out by how much second links are ahead of first ones, whole turns included.
+        Return the angles of second links relative to first links, whole turns included.
 
         :param angles: (4,) of the links, on the branch or close to it [rad].
         :returns: (2,) [rad].
         """
         ahead = angles[self.followers] - angles[self.axes]
-        turns: Array = np.round((ahead - self.apart) / (2.0 * pi))
-        return self.apart + 2.0 * pi * turns
+        turns: Array = np.round((ahead - self.pair_angle) / (2.0 * pi))
+        return self.pair_angle + 2.0 * pi * turns
 
-    def spread(self, path: Array, offsets: Array) -> Array:
+    def to_links(self, path: Array, offsets: Array) -> Array:
         """
         Complete angles of the two axes to those of the links: (..., 2) to (..., 4) [rad].
 
@@ -85,15 +85,15 @@ class Branch:
         return angles
 
     def nearest(self, angles: Array) -> Array:
-        """Return the angles of the links on the branch that are nearest to given ones (4,)."""
+        """Return the nearest link angles on the branch to measured ones (4,) [rad]."""
         offsets = self.offsets(angles)
         ahead = angles[self.followers] - angles[self.axes]
-        return self.spread(angles[self.axes] + 0.5 * (ahead - offsets), offsets)
+        return self.to_links(angles[self.axes] + 0.5 * (ahead - offsets), offsets)
 
     def contains(self, mechanism: Mechanism, angles: Array) -> bool:
-        """Test whether the linkage is on this branch, within `BRANCH_TOLERANCE` (4,)."""
+        """Return whether link angles (4,) are on this branch, and the linkage has it."""
         ahead = (angles[self.followers] - angles[self.axes]).tolist()
-        return (all(abs(wrap(angle - self.apart)) < BRANCH_TOLERANCE for angle in ahead)
+        return (all(abs(wrap(angle - self.pair_angle)) < BRANCH_TOLERANCE for angle in ahead)
                 and (opposite_links_equal(mechanism) if self == PARALLELOGRAM
                      else is_rhombus(mechanism)))
 
@@ -103,31 +103,31 @@ FOLDED = Branch('folded', ((0, 1), (2, 3)), 0.0)
 CROSSED = Branch('crossed', ((0, 3), (1, 2)), pi)
 
 BRANCHES = (PARALLELOGRAM, FOLDED, CROSSED)
-"""All of them; where two meet, the first is assumed."""
+"""All branches; where two meet, the first is assumed."""
 
-LINKS_ALONE: NDArray[np.int64] = PARALLELOGRAM.twins
-"""What stands for the twins where links do not turn in pairs: links a and b are the axes."""
+UNPAIRED_AXES: NDArray[np.int64] = PARALLELOGRAM.paired_links
+"""Stands for `paired_links` where links do not turn in pairs: links a and b are the axes."""
 
 
 def opposite_links_equal(mechanism: Mechanism) -> bool:
-    """Tell whether opposite links are equally long, so that there is a parallelogram."""
+    """Return whether opposite links are equally long, so that there is a parallelogram."""
     lengths = mechanism.link_lengths
     limit = EQUAL_LENGTHS * float(lengths.mean())
     return bool(np.abs(lengths[:2] - lengths[2:]).max() <= limit)
 
 
 def is_rhombus(mechanism: Mechanism) -> bool:
-    """Tell whether all links are equally long, so that there are all branches."""
+    """Return whether all links are equally long, so that there are all branches."""
     lengths = mechanism.link_lengths
     return bool(np.ptp(lengths) <= EQUAL_LENGTHS * float(lengths.mean()))
 
 
 def on_parallelogram(mechanism: Mechanism, link_angles: ArrayLike) -> bool:
     """
-    Tell whether the linkage is on the parallelogram branch.
+    Return whether the linkage is on the parallelogram branch.
 
-    There opposite links stay parallel, and a way leads through change points. Close to one the
-    branches cannot be told apart, and the parallelogram is assumed.
+    There opposite links stay parallel, and paths lead through change points. Close to a change
+    point the branches cannot be distinguished, and the parallelogram is assumed.
 
     :param link_angles: (4,) any turns [rad].
     :returns: True where opposite links are equally long and parallel within `BRANCH_TOLERANCE`.
@@ -135,33 +135,33 @@ def on_parallelogram(mechanism: Mechanism, link_angles: ArrayLike) -> bool:
     return PARALLELOGRAM.contains(mechanism, np.asarray(link_angles, dtype=float))
 
 
-def branch_at(mechanism: Mechanism, link_angles: ArrayLike, *, choosing: bool = False
+def branch_at(mechanism: Mechanism, link_angles: ArrayLike, *, any_branch: bool = False
               ) -> Branch | None:
     """
-    Tell on which branch the linkage is.
+    Return the branch that the linkage is on.
 
     :param link_angles: (4,) any turns [rad].
-    :param choosing: whether others than the parallelogram come into question.
+    :param any_branch: whether branches other than the parallelogram are considered.
     :returns: None where links do not turn in pairs.
     """
     angles = np.asarray(link_angles, dtype=float)
-    for branch in BRANCHES if choosing else BRANCHES[:1]:
+    for branch in BRANCHES if any_branch else BRANCHES[:1]:
         if branch.contains(mechanism, angles):
             return branch
     return None
 
 
 def at_change_point(branch: Branch, angles: Array) -> bool:
-    """Tell whether all links of a linkage on a branch are in line, within `IN_LINE_ANGLE` (4,)."""
+    """Return whether all links (4,) of a linkage on a branch are in line."""
     first, second = branch.axes
     return abs(sin(angles[second] - angles[first])) < IN_LINE_ANGLE
 
 
-def met_at(mechanism: Mechanism, branch: Branch, angles: Array) -> Branch | None:
+def adjoining_branch(mechanism: Mechanism, branch: Branch, angles: Array) -> Branch | None:
     """
-    Find the branch that meets another at a change point.
+    Return the branch that meets another at a change point.
 
-    :param branch: on which the linkage is.
+    :param branch: that the linkage is on.
     :param angles: (4,) of the links [rad].
     :returns: None away from change points, and where links are not equally long.
     """

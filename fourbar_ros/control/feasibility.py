@@ -2,16 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a planned motion needs of the wheels, and whether the motors can give it.
+Feasibility of a planned motion: the speeds, torques and voltages that it needs, and the limits.
 
-Along the way, `A du + b` is what the wheels must meet (paper eq. 6). They share it by
-
-    tau = -V G^T (G V G^T)^-1 (A du + b),
-
-the smallest sum of `tau_i^2 / V_i`; mobilities `V = diag(If)^2` make it paper eq. 8, and 0 leaves
-a wheel out. Speeds follow from `If (d omega/dt + d Omega/dt) = tau`. On the parallelogram branch
-`omega_c = omega_a` and `omega_d = omega_b` at change points too, and so A and b are taken; on
-other branches where links turn in pairs likewise.
+Along the path the wheels must meet `A du + b` (paper eq. 6). The rule of the allocation shares
+this demand without bounds; speeds follow from `If (d omega/dt + d Omega/dt) = tau`. On the
+parallelogram branch `omega_c = omega_a` and `omega_d = omega_b` also at change points, where A
+and b are evaluated on the pairs; likewise on other branches where links turn in pairs.
 """
 
 from __future__ import annotations
@@ -19,14 +15,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import ceil, inf
+from typing import NamedTuple
 
-from fourbar_ros.control.branch import Branch, branch_at, LINKS_ALONE
+from fourbar_ros.control.allocation import Allocation
+from fourbar_ros.control.allocation_solver import allocate, MotorState
+from fourbar_ros.control.branch import Branch, branch_at, UNPAIRED_AXES
 from fourbar_ros.control.computed_torque import pair_terms
-from fourbar_ros.control.setpoint import (
-    angles_along,
-    follow,
-    SetpointError,
-)
+from fourbar_ros.control.setpoint import angles_along, follow_path, SetpointError
 from fourbar_ros.control.soft_step import SoftStep, TrajectorySegment
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism import ClosureError, FLYWHEEL_NAMES, Mechanism
@@ -35,46 +30,41 @@ from fourbar_ros.mechanism.dynamics import reduced_terms_at
 import numpy as np
 from numpy.typing import NDArray
 
-# Share of what the motors can give that a plan may use; the rest is for feedback.
 SHARE = 0.95
+"""Share of the motor limits that a plan may use; the rest is for feedback."""
 
-# Instants at which a way is looked at, at least; odd, so that the middle of a step is one.
 SAMPLES = 201
+"""Smallest number of instants at which a path is evaluated; odd, to include its middle."""
 
-# Of the largest demand, what usable wheels may leave unmet: far above rounding.
 UNMET = 1e-6
+"""Share of the largest demand that usable wheels may leave unmet: far above rounding errors."""
 
-# Of the square of its trace, the determinant of G V G^T below which it counts as singular.
-SINGULAR = 1e-12
-
-# Of a limit, far above rounding and far below what anybody would notice.
 ROUNDING = 1e-9
+"""Share of a limit that is far above rounding errors and far below what can be measured."""
 
-# Between these durations the shortest is sought [s].
 LEAST_DURATION = 0.1
 LONGEST_DURATION = 3600.0
+"""Range in which the shortest duration is searched [s], that of `setpoint_duration`."""
 
-# Step of the scan for it, and how exactly it is found.
 SCAN_RATIO = 1.25
 RESOLUTION = 1e-3
+"""Ratio of two durations of the scan, and relative resolution of the bisection after it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Wheels:
     """
-    The wheels as they are at the beginning.
+    State of the wheels at the start of a motion.
 
     :param speeds: (4,) relative to the links [rad/s].
-    :param mobilities: (4,) V: they share for the smallest sum of torque^2 / V, and 0 is a wheel
-        that cannot be used. Flywheel inertias squared make it the least wheel accelerations.
-    :param extra_torque: (4,) friction that the motor of a wheel that turns has to overcome besides
-        [N m].
-    :param torque_share: of torques and voltages that a plan may use, None for as much as of the
-        speeds.
+    :param allocation: the rule that shares the demand, with the wheels that it may use.
+    :param extra_torque: (4,) friction that the motor of a turning wheel must overcome [N m].
+    :param torque_share: share of the torque and voltage limits that a plan may use, None for the
+        same share as of the speed limits.
     """
 
     speeds: Array
-    mobilities: Array
+    allocation: Allocation
     extra_torque: Array = field(default_factory=lambda: np.zeros(4))
     torque_share: float | None = None
 
@@ -82,11 +72,12 @@ class Wheels:
 @dataclass(frozen=True, eq=False)
 class Needs:
     """
-    What a motion needs of the wheels, largest sizes along the way.
+    Needs of a motion: largest magnitudes along the path.
 
     :param peak_speeds: (4,) relative to the links [rad/s].
     :param peak_torques: (4,) of the motors, friction included [N m].
-    :param peak_voltages: (4,) at the windings, 0 where these are not described [V].
+    :param peak_voltages: (4,) at the windings, 0 where the mechanism file does not describe them
+        [V].
     :param end_speeds: (4,) with sign, at the end [rad/s].
     :param unmet: share of the largest demand that the usable wheels leave unmet.
     """
@@ -98,113 +89,158 @@ class Needs:
     unmet: float
 
 
-def needs_of(mechanism: Mechanism, way: TrajectorySegment, present: Array, wheels: Wheels,
+class Path(NamedTuple):
+    """
+    A planned motion at n instants.
+
+    :param times: (n,) [s].
+    :param angles: (n, 4) of the links [rad].
+    :param motion: (n, 2, 2) rates and accelerations of the axes [rad/s], [rad/s^2].
+    :param paired: whether links turn in pairs.
+    :param paired_links: (4,) see `Branch`; without pairs the first two are the axes.
+    """
+
+    times: Array
+    angles: Array
+    motion: Array
+    paired: bool
+    paired_links: NDArray[np.int64]
+
+
+def path_of(mechanism: Mechanism, segment: TrajectorySegment, present: Array,
+            branch: Branch | None = None, samples: int = SAMPLES) -> Path:
+    """
+    Sample a planned motion.
+
+    :param present: (4,) link angles at its start, which determine the branch [rad].
+    :param branch: of the motion, by default that of `present`, see `setpoint.plan`.
+    :param samples: smallest number of instants.
+    :raises ClosureError: the loop cannot close on the path.
+    """
+    times = segment.instants(samples)
+    states = segment.sample(times)
+    branch = branch or branch_at(mechanism, present)
+    angles = angles_along(mechanism, states[:, 0], present, branch)
+    return Path(times, angles, states[:, 1:], branch is not None,
+                UNPAIRED_AXES if branch is None else branch.paired_links)
+
+
+def loads_along(mechanism: Mechanism, path: Path, allocation: Allocation, speeds: Array
+                ) -> tuple[Array, Array, float]:
+    """
+    Share the demand along a path among the wheels, without bounds.
+
+    :param speeds: (4,) of the wheels at its start, relative to the links [rad/s].
+    :returns: torques on the wheels (n, 4) [N m]; gain of their speed relative to the links (n, 4)
+        [rad/s]; the share of the largest demand that is not met.
+    """
+    rule = allocation.for_plan(float(np.diff(path.times).max()), mechanism.motor_torque_limits)
+    torques, gained, unmet = _loads_along(
+        path, rule.rule, np.asarray(speeds, dtype=float), np.array([mechanism.constants]))
+    return torques, gained, unmet
+
+
+def needs_of(mechanism: Mechanism, segment: TrajectorySegment, present: Array, wheels: Wheels,
              branch: Branch | None = None) -> Needs:
     """
-    Work out what a motion needs of the wheels.
+    Evaluate the needs of a motion.
 
-    :param present: (4,) link angles where it begins, which tell the branch [rad].
-    :param branch: as of `setpoint.plan`.
-    :raises SetpointError: the loop cannot close on the way.
+    :param present, branch: see :func:`path_of`.
+    :raises SetpointError: the loop cannot close on the path.
     """
-    times = way.instants(SAMPLES)
-    states = way.sample(times)
-    branch = branch or branch_at(mechanism, present)
     try:
-        angles = angles_along(mechanism, states[:, 0], present, branch)
+        path = path_of(mechanism, segment, present, branch)
     except ClosureError as error:
-        raise SetpointError(f'on the way there {error}') from None
-    torques, gained, unmet = wheel_loads(
-        times, angles, states[:, 1:], branch is not None,
-        LINKS_ALONE if branch is None else branch.twins,
-        np.asarray(wheels.mobilities, dtype=float), np.array([mechanism.constants]))
+        raise SetpointError(
+            f'on the path {error}', **{'name': 'closure', **error.values}) from None
+    torques, gained, unmet = loads_along(mechanism, path, wheels.allocation, wheels.speeds)
     speeds = wheels.speeds + gained
-    # Friction acts against the wheel; at rest, against where it is about to go.
+    # Friction acts against the speed; at rest, against the motion that is about to start.
     direction = np.where(speeds == 0.0, np.sign(torques), np.sign(speeds))
-    torques += np.where(wheels.mobilities > 0.0, wheels.extra_torque, 0.0) * direction
+    torques += np.where(
+        wheels.allocation.weights_inv > 0.0, wheels.extra_torque, 0.0) * direction
     return Needs(np.abs(speeds).max(axis=0), np.abs(torques).max(axis=0),
                  np.abs(_voltages(mechanism, speeds, torques)).max(axis=0), speeds[-1], unmet)
 
 
-def check_needs(mechanism: Mechanism, way: TrajectorySegment, present: Array, wheels: Wheels, *,
-                share: float = SHARE, crossing: bool = False, branch: Branch | None = None
+def check_needs(mechanism: Mechanism, segment: TrajectorySegment, present: Array, wheels: Wheels,
+                *, share: float = SHARE, crossing: bool = False, branch: Branch | None = None
                 ) -> Needs:
     """
-    Refuse a motion for which the wheels are too weak.
+    Refuse a motion that needs more than the motors can give.
 
     A wheel that is faster now than its share of the limit may stay as fast, but get no faster.
 
-    :param present: (4,) link angles where it begins [rad].
-    :param share: of the limits of the motors that it may use.
-    :param crossing: as of `setpoint.follow`, for the shortest duration that is told.
-    :param branch: as of `setpoint.plan`.
-    :returns: what it needs.
-    :raises SetpointError: it needs too much; tells the wheel that lacks most, what it needs, the
-        limit and, for a soft step, the shortest duration.
+    :param present, branch: see :func:`path_of`.
+    :param share: share of the motor limits that the motion may use.
+    :param crossing: see `setpoint.follow_path`; for the shortest duration in the message.
+    :raises SetpointError: it needs too much. `values`: `name` of the wheel that lacks most, its
+        `value` and `limit`, and for a soft step the shortest `duration` [s].
     """
-    needs = needs_of(mechanism, way, present, wheels, branch)
-    excess, problem = _worst(mechanism, needs, wheels, share)
+    needs = needs_of(mechanism, segment, present, wheels, branch)
+    excess, problem, values = _worst(mechanism, needs, wheels, share)
     if excess <= 1.0 + ROUNDING:
         return needs
-    if isinstance(way, SoftStep) and needs.unmet <= UNMET:
+    if isinstance(segment, SoftStep) and needs.unmet <= UNMET:
         try:
-            shortest = shortest_duration(mechanism, way.start, way.goal, present, wheels,
-                                         share=share, crossing=crossing, branch=branch)
+            shortest = shortest_duration(mechanism, segment, present, wheels, share=share,
+                                         crossing=crossing, branch=branch)
         except SetpointError as error:
             problem += f'; {error}'
         else:
-            # Rounded up, so that it is enough.
-            problem += f'; shortest duration is {ceil(shortest * 100.0) / 100.0:g} s'
-    raise SetpointError(problem)
+            # Rounded up, so that the setpoint with this duration is accepted.
+            values['duration'] = ceil(shortest * 100.0) / 100.0
+            problem += f'; shortest duration is {values["duration"]:g} s'
+    raise SetpointError(problem, **values)
 
 
-def shortest_duration(mechanism: Mechanism, start: Array, goal: Array, present: Array,
-                      wheels: Wheels, *, share: float = SHARE, crossing: bool = False,
-                      branch: Branch | None = None) -> float:
+def shortest_duration(mechanism: Mechanism, step: SoftStep, present: Array, wheels: Wheels, *,
+                      share: float = SHARE, crossing: bool = False, branch: Branch | None = None
+                      ) -> float:
     """
     Find the least duration for which a soft step keeps the limits of the motors.
 
-    From rest the needs fall as the duration grows, and the answer is the least. From motion they
-    need not, since a slow step swings far out: the answer is the first that a scan upwards by
-    `SCAN_RATIO` meets, refined, and a narrow window below it may be missed. From motion the way
-    depends on the duration, too, and is followed; from rest it does not, and is not.
+    From rest the needs fall as the duration grows, and the result is the least. From motion they
+    need not fall, since a slow step swings far out: the result is the first that a scan upwards
+    by `SCAN_RATIO` meets, refined, and a narrow window below it may be missed. From motion the
+    path depends on the duration and is followed for each; from rest it does not.
 
-    :param start: (3, 2) reference angle, rate and acceleration of the axes now, (phi_a, phi_b)
-        or those of the branch.
-    :param goal: (2,) of the axes [rad].
-    :param present: (4,) reference of the link angles now [rad].
-    :param share: of the limits of the motors that it may use.
-    :param crossing: whether the way may meet change points, as of `setpoint.follow`.
-    :param branch: as of `setpoint.plan`.
-    :returns: at least `LEAST_DURATION`, not more than `RESOLUTION` of it too long [s].
+    :param step: start and goal; its duration is ignored.
+    :param present, branch: see :func:`path_of`.
+    :param share: share of the motor limits that the motion may use.
+    :param crossing: whether the path may meet change points, see `setpoint.follow_path`.
+    :returns: at least `LEAST_DURATION`, at most `RESOLUTION` of it too long [s].
     :raises SetpointError: no duration up to `LONGEST_DURATION` is enough.
     """
-    moving = bool(start[1:].any())
+    moving = bool(step.start[1:].any())
 
     def excess(duration: float) -> float:
-        step = SoftStep(start, goal, duration)
+        timed = SoftStep(step.start, step.goal, duration)
         try:
             if moving:
-                follow(mechanism, step, present, crossing=crossing, branch=branch)
-            needs = needs_of(mechanism, step, present, wheels, branch)
+                follow_path(mechanism, timed, present, crossing=crossing, branch=branch)
+            needs = needs_of(mechanism, timed, present, wheels, branch)
         except SetpointError:
             return inf
         return _worst(mechanism, needs, wheels, share)[0]
 
-    found = _first_below(excess, LEAST_DURATION, LONGEST_DURATION)
-    if found is not None:
-        return found
-    stored = np.abs(wheels.speeds)
-    wheel = int(np.argmax(stored / mechanism.motor_speed_limits))
-    if stored[wheel] >= share * mechanism.motor_speed_limits[wheel]:
+    shortest = _first_below(excess, LEAST_DURATION, LONGEST_DURATION)
+    if shortest is not None:
+        return shortest
+    speeds, limits = np.abs(wheels.speeds), mechanism.motor_speed_limits
+    wheel = int(np.argmax(speeds / limits))
+    if speeds[wheel] >= share * limits[wheel]:
+        name = FLYWHEEL_NAMES[wheel]
         raise SetpointError(
-            f'more time does not help: {FLYWHEEL_NAMES[wheel]} turns at {stored[wheel]:.4g} rad/s '
-            'already, and momentum is not lost')
-    raise SetpointError(f'no duration up to {LONGEST_DURATION:g} s is long enough')
+            f'no duration is long enough: {name} is near its speed limit ({speeds[wheel]:.4g} of '
+            f'{limits[wheel]:.4g} rad/s); reverse the manoeuvre to unload it',
+            name=name, value=float(speeds[wheel]), limit=float(limits[wheel]))
+    raise SetpointError(f'no duration up to {LONGEST_DURATION:g} s is long enough',
+                        limit=LONGEST_DURATION)
 
 
 def _first_below(excess: Callable[[float], float], least: float, longest: float) -> float | None:
-    """Scan upwards for an excess of at most 1, then bisect; None if there is none."""
+    """Scan upwards for an excess of at most 1, then bisect; return None without one."""
     low, high = None, least
     while not excess(high) <= 1.0 + ROUNDING:
         if high >= longest:
@@ -220,39 +256,42 @@ def _first_below(excess: Callable[[float], float], least: float, longest: float)
 
 
 def _worst(mechanism: Mechanism, needs: Needs, wheels: Wheels, share: float
-           ) -> tuple[float, str]:
-    """Return the largest need over its limit, and what to say of it; of no number, infinity."""
+           ) -> tuple[float, str, dict[str, object]]:
+    """Return the largest ratio of a need to its limit (inf for NaN), its message and values."""
     if not needs.unmet <= UNMET:
-        usable = [name for name, mobility in zip(FLYWHEEL_NAMES, wheels.mobilities) if mobility]
+        usable = [name for name, weight in zip(FLYWHEEL_NAMES, wheels.allocation.weights_inv)
+                  if weight]
         return inf, (f'{", ".join(usable) or "no flywheel"} can be used, which leaves '
-                     f'{100.0 * needs.unmet:.3g} % of the torque needed unmet')
-    worst, problem = 0.0, ''
+                     f'{100.0 * needs.unmet:.3g} % of the torque needed unmet'), {
+                         'usable': usable, 'value': needs.unmet, 'limit': UNMET}
+    worst, problem, values = 0.0, '', {}
     of_torque = share if wheels.torque_share is None else wheels.torque_share
-    for needed, limits, part, now, unit, word in (
+    for needed, limits, part, now, unit, source in (
             (needs.peak_speeds, mechanism.motor_speed_limits, share, np.abs(wheels.speeds),
              'rad/s', 'motor'),
             (needs.peak_torques, mechanism.motor_torque_limits, of_torque, np.zeros(4), 'N m',
              'motor'),
             (needs.peak_voltages, mechanism.motor_voltages, of_torque,
-             _holding_voltages(mechanism, wheels), 'V', 'supply')):
+             _voltages(mechanism, np.abs(wheels.speeds), wheels.extra_torque), 'V', 'supply')):
         ratios = np.nan_to_num(needed / np.maximum(part * limits, now), nan=inf)
         wheel = int(np.argmax(ratios))
         if ratios[wheel] > worst:
-            worst = float(ratios[wheel])
+            worst, name = float(ratios[wheel]), FLYWHEEL_NAMES[wheel]
             limit = part * limits[wheel]
-            of_what = f"{100.0 * part:g} % of the {word}'s {limits[wheel]:.4g} {unit}"
+            origin = f"{100.0 * part:g} % of the {source}'s {limits[wheel]:.4g} {unit}"
             if now[wheel] > limit:
-                limit, of_what = now[wheel], f'what it is now, above {of_what}'
-            problem = (f'needs {needed[wheel]:.4g} {unit} on {FLYWHEEL_NAMES[wheel]}, limit '
-                       f'{limit:.4g} {unit} ({of_what})')
-    return worst, problem
+                limit, origin = now[wheel], f'its present value, above {origin}'
+            problem = (f'needs {needed[wheel]:.4g} {unit} on {name}, limit {limit:.4g} {unit} '
+                       f'({origin})')
+            values = {'name': name, 'value': float(needed[wheel]), 'limit': float(limit)}
+    return worst, problem, values
 
 
 def _voltages(mechanism: Mechanism, speeds: Array, torques: Array) -> Array:
     """
     Evaluate the voltages at the windings: (..., 4) [V].
 
-    `U = R tau / k + k Omega`; a motor gives the torque as long as the supply covers it.
+    `U = R tau / k + k Omega`; a motor gives the torque while the supply covers this voltage.
     """
     described = (mechanism.motor_resistances > 0.0) & (mechanism.motor_voltages < inf)
     constants = np.where(described, mechanism.motor_torque_constants, 1.0)
@@ -260,86 +299,53 @@ def _voltages(mechanism: Mechanism, speeds: Array, torques: Array) -> Array:
         described, mechanism.motor_resistances * torques / constants + constants * speeds, 0.0)
 
 
-def _holding_voltages(mechanism: Mechanism, wheels: Wheels) -> Array:
-    return _voltages(mechanism, np.abs(wheels.speeds), wheels.extra_torque)
-
-
 @kernel
-def wheel_loads(times: Array, angles: Array, motion: Array, paired: bool,
-                twins: NDArray[np.int64], mobilities: Array, constants: NDArray[np.record]
-                ) -> tuple[Array, Array, float]:
-    """
-    Share the demand along a way among the wheels.
-
-    :param times: (n,) [s].
-    :param angles: (n, 4) of the links [rad].
-    :param motion: (n, 2, 2) rates and accelerations of the axes [rad/s], [rad/s^2].
-    :param paired, twins: see axes.axes_of; of links alone, the axes come first in twins.
-    :param mobilities: (4,), 0 where a wheel cannot be used.
-    :param constants: (1,) of the mechanism.
-    :returns: (n, 4) torques [N m]; (n, 4) what the wheels gain in speed relative to their links
-        [rad/s]; the share of the largest demand that is not met.
-    """
+def _loads_along(path: Path, rule: NDArray[np.record], start_speeds: Array,
+                 constants: NDArray[np.record]) -> tuple[Array, Array, float]:
+    """See :func:`loads_along`."""
+    times, angles, motion, links = path.times, path.angles, path.motion, path.paired_links
     count = times.size
     inertias = constants[0].flywheel_inertias
     torques, gained = np.zeros((count, 4)), np.zeros((count, 4))
-    link_rates = np.empty((count, 4))
-    share = np.empty(2)
+    link_rates, driven = np.empty((count, 4)), np.zeros(4)
+    demand, wheel_map = np.empty(2), np.zeros((2, 4))
+    motors = MotorState(np.full(4, -inf), np.full(4, inf), start_speeds.copy())
     largest = unmet = 0.0
-    wheel_map = np.zeros((4, 2))
     for axis in range(2):
-        wheel_map[twins[axis], axis] = wheel_map[twins[axis + 2], axis] = 1.0
+        wheel_map[axis, links[axis]] = wheel_map[axis, links[axis + 2]] = 1.0
     for n in range(count):
-        if not paired:
+        if not path.paired:
             a00, a01, a11, b0, b1, g1, g2, g3, g4, _, _ = reduced_terms_at(
                 angles[n], motion[n, 0], constants[0])
-            wheel_map[2, 0], wheel_map[2, 1], wheel_map[3, 0], wheel_map[3, 1] = g1, g2, g3, g4
+            wheel_map[0, 2], wheel_map[1, 2], wheel_map[0, 3], wheel_map[1, 3] = g1, g2, g3, g4
         for wheel in range(4):
-            link_rates[n, wheel] = (wheel_map[wheel, 0] * motion[n, 0, 0]
-                                    + wheel_map[wheel, 1] * motion[n, 0, 1])
-        if paired:
+            link_rates[n, wheel] = (wheel_map[0, wheel] * motion[n, 0, 0]
+                                    + wheel_map[1, wheel] * motion[n, 0, 1])
+        if path.paired:
             _, _, a00, a01, a11, b0, b1 = pair_terms(
                 angles[n], (link_rates[n, 0], link_rates[n, 1], link_rates[n, 2],
-                            link_rates[n, 3]), twins, constants[0])
-        demand_a = a00 * motion[n, 1, 0] + a01 * motion[n, 1, 1] + b0
-        demand_b = a01 * motion[n, 1, 0] + a11 * motion[n, 1, 1] + b1
-        _solve_shares(wheel_map, mobilities, demand_a, demand_b, share)
-        left_a, left_b = demand_a, demand_b
+                            link_rates[n, 3]), links, constants[0])
+        demand[0] = a00 * motion[n, 1, 0] + a01 * motion[n, 1, 1] + b0
+        demand[1] = a01 * motion[n, 1, 0] + a11 * motion[n, 1, 1] + b1
+        if n > 0:
+            step = times[n] - times[n - 1]
+            # Predicted with the last torque, for rules that depend on the speeds.
+            for wheel in range(4):
+                motors.speeds[wheel] = (
+                    start_speeds[wheel]
+                    + driven[wheel] + step * torques[n - 1, wheel] / inertias[wheel]
+                    - link_rates[n, wheel] + link_rates[0, wheel])
+        allocate(rule[0], wheel_map, demand, motors, torques[n])
+        left_a, left_b = demand[0], demand[1]
         for wheel in range(4):
-            first, second = wheel_map[wheel, 0], wheel_map[wheel, 1]
-            torque = -mobilities[wheel] * (first * share[0] + second * share[1])
-            torques[n, wheel] = torque
-            left_a += first * torque
-            left_b += second * torque
-        largest = max(largest, abs(demand_a), abs(demand_b))
+            torque = torques[n, wheel]
+            left_a += wheel_map[0, wheel] * torque
+            left_b += wheel_map[1, wheel] * torque
+            if n > 0:
+                # The trapezoid for a smooth torque; the change of the link's rate is exact.
+                driven[wheel] += 0.5 * (times[n] - times[n - 1]) * (
+                    torques[n - 1, wheel] + torque) / inertias[wheel]
+                gained[n, wheel] = driven[wheel] - link_rates[n, wheel] + link_rates[0, wheel]
+        largest = max(largest, abs(demand[0]), abs(demand[1]))
         unmet = max(unmet, abs(left_a), abs(left_b))
-    for wheel in range(4):
-        driven = 0.0
-        for n in range(1, count):
-            # The trapezoid for a smooth torque; what the link turns is exact.
-            driven += 0.5 * (times[n] - times[n - 1]) * (
-                torques[n - 1, wheel] + torques[n, wheel]) / inertias[wheel]
-            gained[n, wheel] = driven - link_rates[n, wheel] + link_rates[0, wheel]
     return torques, gained, unmet / largest if largest > 0.0 else 0.0
-
-
-@kernel
-def _solve_shares(wheel_map: Array, mobilities: Array, demand_a: float, demand_b: float,
-                  share: Array) -> None:
-    """Solve G V G^T share = demand; by the pseudo-inverse where wheels do not reach both axes."""
-    n00 = n01 = n11 = 0.0
-    for wheel in range(4):
-        first, second = wheel_map[wheel, 0], wheel_map[wheel, 1]
-        n00 += mobilities[wheel] * first * first
-        n01 += mobilities[wheel] * first * second
-        n11 += mobilities[wheel] * second * second
-    determinant, trace = n00 * n11 - n01 * n01, n00 + n11
-    if determinant > SINGULAR * trace * trace:
-        share[0] = (n11 * demand_a - n01 * demand_b) / determinant
-        share[1] = (n00 * demand_b - n01 * demand_a) / determinant
-    elif trace > 0.0:
-        # Of rank one, N = trace w w^T.
-        share[0] = (n00 * demand_a + n01 * demand_b) / (trace * trace)
-        share[1] = (n01 * demand_a + n11 * demand_b) / (trace * trace)
-    else:
-        share[0] = share[1] = 0.0

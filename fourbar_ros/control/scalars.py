@@ -1,13 +1,13 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the controller tells besides its commands, as named scalars."""
+"""Named scalars of the topics `allocation` and `momentum`."""
 
 from __future__ import annotations
 
 from math import isfinite
 
-from fourbar_ros.control.computed_torque import A00, A01, A11, CONDITION
+from fourbar_ros.control.allocation_solver import MotorState
 from fourbar_ros.control.controller import Controller
 from fourbar_ros.control.null_space import null_torques
 from fourbar_ros.mechanism.constants import Array
@@ -20,44 +20,44 @@ ALLOCATION = (
     'scale', 'condition_number', 'branch_hold', *(f'saturated_{link}' for link in LINKS),
     *(f'verdict_{link}' for link in LINKS), *(f'null_speed_{link}_rad_s' for link in LINKS))
 """
-Names of what :func:`allocation_scalars` returns: share of what was asked for that the motors can
-give; cond(A); how much of the hold on the branch there is; which motors are at a bound; what is
-the matter with each wheel, as index of `wheel_watch.VERDICTS`; and the part of the speed of each
-wheel that moves no link.
+Names of :func:`allocation_scalars`: share of the demand that the motors can meet; cond(A); share
+of the branch hold; whether each motor is at a bound; fault state of each wheel, as index of
+`wheel_fault_detection.FAULT_STATES`; and the part of each wheel speed in the null space.
 """
 
 MOMENTUM = ('total_n_m_s', 'axis_a_n_m_s', 'axis_b_n_m_s', 'margin', 'time_left_s')
 """
-Names of what :func:`momentum_scalars` returns: angular momentum of the whole; of the axes; the
-least share of a speed limit that is left; and when the first wheel meets its limit.
+Names of :func:`momentum_scalars`: angular momentum of the whole linkage and of the axes; the
+least share of a speed limit that is left; and the time until drift brings a wheel to its limit.
 """
 
-# A torque as near to its bound as this, as a share, is at it.
 AT_BOUND = 1e-6
+"""A torque within this share of the range between its bounds counts as at its bound."""
 
 
 def allocation_scalars(controller: Controller) -> Array:
     """Return the scalars of `ALLOCATION` at the last tick."""
-    found = controller.law.decision
+    output, axes = controller.law.output, controller.law.output.axes
     inertias = controller.mechanism.flywheel_inertias
-    reach = AT_BOUND * (found.upper - found.lower)
-    saturated = (found.torques > found.upper - reach) | (found.torques < found.lower + reach)
+    reach = AT_BOUND * (output.upper - output.lower)
+    saturated = (output.torques > output.upper - reach) | (output.torques < output.lower + reach)
     momenta, free, unlimited = inertias * controller.speeds, np.zeros(4), np.full(4, np.inf)
-    null_torques(found.rows[:2], inertias, momenta, -unlimited, unlimited, np.zeros(4), free)
+    null_torques(axes.wheel_map[:2], inertias, momenta,
+                 MotorState(-unlimited, unlimited, controller.speeds), np.zeros(4), free)
     return np.array([
-        found.scale, found.terms[CONDITION], found.hold, *(saturated & controller.wheels.usable),
-        *controller.wheels.verdicts, *(free / inertias)])
+        output.scale, axes.condition, axes.hold, *(saturated & controller.wheels.usable),
+        *controller.wheels.fault_states, *(free / inertias)])
 
 
 def momentum_scalars(controller: Controller) -> tuple[tuple[str, ...], Array]:
-    """Return names and values of `MOMENTUM` at the last tick, without what never comes."""
-    mechanism, found = controller.mechanism, controller.law.decision
+    """Return names and values of `MOMENTUM` at the last tick, without an infinite time left."""
+    mechanism, axes = controller.mechanism, controller.law.output.axes
     absolute = controller.speeds + controller.rates
-    held = found.rows[:2] @ (mechanism.flywheel_inertias * absolute)
-    a00, a01, a11 = found.terms[[A00, A01, A11]]
-    axes = held + np.array([[a00, a01], [a01, a11]]) @ controller.rates[controller.law.axes]
+    of_wheels = axes.wheel_map[:2] @ (mechanism.flywheel_inertias * absolute)
+    momenta = of_wheels + np.array([[axes.a00, axes.a01], [axes.a01, axes.a11]]) @ (
+        controller.rates[controller.law.axes])
     left = controller.momentum.time_left(controller.speeds)
     values = np.array([
-        angular_momentum(mechanism, controller.angles, controller.rates, absolute), *axes,
+        angular_momentum(mechanism, controller.angles, controller.rates, absolute), *momenta,
         controller.momentum.margins(controller.speeds).min(), left])
     return (MOMENTUM, values) if isfinite(left) else (MOMENTUM[:-1], values[:-1])

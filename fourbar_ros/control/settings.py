@@ -1,64 +1,78 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How the controller behaves, as a person sets it."""
+"""Settings of the controller and the parameters of its node."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fourbar_ros.common.settings import Setting, setting, Settings, settings_of
+from fourbar_ros.control.allocation import ALLOCATIONS
 from fourbar_ros.control.null_space import TARGETS
 
-# What the wheels are told.
 COMMANDS = ('effort', 'velocity')
+"""Kinds of wheel command: motor torque or wheel speed."""
 
-# What the freedom that moves no link is used for.
 WHEEL_TARGETS = ('free', *TARGETS)
+"""Targets of the null-space control of the wheel speeds; `free` applies none."""
 
-# What a setpoint's time is.
 TIMINGS = ('duration', 'shortest')
+"""Duration of a setpoint's move: `setpoint_duration`, or the shortest that the wheels allow."""
 
-# What becomes of moves that meet a change point.
 CHANGE_POINTS = ('avoid', 'keep', 'choose')
+"""Treatment of moves that meet a change point."""
 
 
 @dataclass(frozen=True)
-class ControllerSettings:
+class ControllerSettings(Settings):
     """
-    How the controller behaves.
+    Settings of the controller; all of them may be changed at run time.
 
-    :param bandwidth: natural frequency of the tracking error [rad/s].
-    :param damping: damping ratio of the tracking error.
-    :param setpoint_duration: time in which a setpoint is reached [s].
-    :param setpoint_timing: `duration`, or `shortest` for the least time that the wheels allow.
-    :param command: what the wheels are told, `effort` or `velocity`.
-    :param allocation: how they share, one of `allocation.ALLOCATIONS`.
-    :param wheel_target: what the freedom that moves no link is used for: `free` (nothing),
-        or one of `null_space.TARGETS`.
-    :param wheel_bias: speed of wheels that are kept away from standstill [rad/s].
-    :param wheel_bandwidth: how fast wheel speeds go to their target [rad/s].
-    :param disturbance_compensation: share of the estimated disturbance that is compensated.
-    :param bearing_coulomb, bearing_viscous: friction of the wheels' bearings, which `effort`
-        compensates [N m], [N m s].
-    :param rest_band: errors of the configuration that do nothing at rest, where friction in the
-        joints holds it; 0 where there is none [rad].
-    :param change_points: `avoid` refuses moves that meet one, `keep` crosses and parks on the
-        parallelogram's branch, `choose` also leaves on the other branch where a setpoint names it.
-    :param branch_bandwidth: natural frequency of the hold on the branch at change points [rad/s].
+    `change_points`: `avoid` refuses moves that meet a change point, `keep` crosses it and parks
+    there on the parallelogram branch, `choose` also leaves it on the other branch where a
+    setpoint names it.
     """
 
-    bandwidth: float = 4.0
-    damping: float = 0.9
-    setpoint_duration: float = 10.0
-    setpoint_timing: str = 'duration'
-    command: str = 'effort'
-    allocation: str = 'min_norm'
-    wheel_target: str = 'free'
-    wheel_bias: float = 30.0
-    wheel_bandwidth: float = 0.5
-    disturbance_compensation: float = 1.0
-    bearing_coulomb: float = 0.0
-    bearing_viscous: float = 0.0
-    rest_band: float = 0.0
-    change_points: str = 'avoid'
-    branch_bandwidth: float = 8.0
+    bandwidth: float = setting(4.0, 'rad/s', 'natural frequency of tracking errors',
+                               low=0.1, high=20.0, live=True)
+    damping: float = setting(0.9, '', 'damping ratio of tracking errors',
+                             low=0.1, high=2.0, live=True)
+    setpoint_duration: float = setting(10.0, 's', 'time in which a setpoint is reached',
+                                       low=0.1, high=3600.0, live=True)
+    setpoint_timing: str = setting('duration', '', 'duration of a setpoint: setpoint_duration, or '
+                                   'the shortest that the wheels allow',
+                                   choices=TIMINGS, live=True)
+    command: str = setting('effort', '', 'kind of wheel command: motor torque or wheel speed',
+                           choices=COMMANDS, live=True)
+    allocation: str = setting('min_norm', '', 'rule that shares the demand among the wheels',
+                              choices=ALLOCATIONS, live=True)
+    wheel_target: str = setting('free', '', 'target of the wheel speeds in the null space, which '
+                                'moves no link', choices=WHEEL_TARGETS, live=True)
+    wheel_bias: float = setting(30.0, 'rad/s', 'wheel speed of the target `bias`',
+                                low=-1000.0, high=1000.0, live=True)
+    wheel_bandwidth: float = setting(0.5, 'rad/s', 'bandwidth of the wheel speeds towards their '
+                                     'target', low=0.0, high=10.0, live=True)
+    disturbance_compensation: float = setting(
+        1.0, '', 'share of the estimated disturbance that is compensated', low=0.0, high=1.0,
+        live=True)
+    bearing_coulomb: float = setting(0.0, 'N m', 'Coulomb friction of the wheel bearings',
+                                     low=0.0, high=10.0, live=True)
+    bearing_viscous: float = setting(0.0, 'N m s', 'viscous friction of the wheel bearings',
+                                     low=0.0, high=10.0, live=True)
+    rest_band: float = setting(0.0, 'rad', 'dead band of configuration errors at rest, where the '
+                               'joints stick', low=0.0, high=0.1, live=True)
+    change_points: str = setting('avoid', '', 'refuse moves that meet a change point, keep the '
+                                 'branch there, or choose it', choices=CHANGE_POINTS, live=True)
+    branch_bandwidth: float = setting(8.0, 'rad/s', 'natural frequency of the branch hold at '
+                                      'change points', low=0.0, high=20.0, live=True)
+
+
+SETTINGS = settings_of(ControllerSettings)
+"""Declarations of the fields of `ControllerSettings`."""
+
+PARAMETERS = (
+    Setting('mechanism', 'paper', '', 'preset or path of a mechanism file'),
+    *SETTINGS,
+)
+"""All parameters of the node."""

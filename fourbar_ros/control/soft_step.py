@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Reference motion: the paper's soft step as a quintic with given ends.
+Soft step of the paper as a quintic between two states.
 
-Axes are (phi_a, phi_b) throughout.
+Angles are those of two axes, links a and b or the pairs of a branch.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 @kernel
 def evaluate(coefficients: Array, time: float, duration: float) -> Array:
     """
-    Evaluate polynomials in time / duration, and their derivatives after the time.
+    Evaluate polynomials in time / duration, and their derivatives with respect to time.
 
     :param coefficients: (6, axes).
     :returns: (3, axes).
@@ -41,7 +41,7 @@ def evaluate(coefficients: Array, time: float, duration: float) -> Array:
 
 def evaluate_many(coefficients: Array, s: Array, duration: ArrayLike) -> Array:
     """
-    Do what :func:`evaluate` does, at many instants.
+    Evaluate polynomials like :func:`evaluate`, at many instants.
 
     :param coefficients: (6, axes), or (n, 6, axes) for polynomials of their own.
     :param s: (n,) time / duration.
@@ -63,7 +63,7 @@ def evaluate_many(coefficients: Array, s: Array, duration: ArrayLike) -> Array:
 
 def quintic(start: Array, end: Array, duration: float) -> Array:
     """
-    Find the quintic between two states.
+    Return the quintic between two states.
 
     :param start, end: (3, axes) angle, rate and acceleration [rad, rad/s, rad/s^2].
     :param duration: [s].
@@ -91,7 +91,7 @@ class TrajectorySegment(Protocol):
         """Evaluate angle, rate and acceleration (3, 2) at a time since the start [s]."""
 
     def instants(self, count: int) -> Array:
-        """Choose times at which to look at it, both ends included: (n,), n >= count [s]."""
+        """Choose instants for a check, both ends included: (n,), n >= count [s]."""
 
     def sample(self, times: Array) -> Array:
         """Evaluate like `at` for times (n,) within the duration [s]: (n, 3, 2)."""
@@ -100,10 +100,9 @@ class TrajectorySegment(Protocol):
 @dataclass(frozen=True, eq=False)
 class SoftStep:
     """
-    A move between two states that starts and ends with continuous rate and acceleration.
+    A move between two states with continuous rate and acceleration at both ends.
 
-    From rest it is the paper's soft step, `10 s^3 - 15 s^4 + 6 s^5`. Started in motion it takes
-    over rate and acceleration without a jump.
+    From rest it is the paper's soft step, `10 s^3 - 15 s^4 + 6 s^5`.
 
     :param start: (3, 2) angle, rate and acceleration at time 0 [rad, rad/s, rad/s^2].
     :param goal: (2,) angles at the end, at rest [rad].
@@ -125,7 +124,7 @@ class SoftStep:
         return evaluate(self._coefficients, max(time, 0.0), self.duration)
 
     def instants(self, count: int) -> Array:
-        """Choose times evenly, both ends included: (count,) [s]."""
+        """Choose equidistant instants, both ends included: (count,) [s]."""
         return np.linspace(0.0, self.duration, count)
 
     def sample(self, times: Array) -> Array:

@@ -1,91 +1,118 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""From where the links are and should be to the torques of the wheels, in one kernel."""
+"""The tracking law in one kernel: estimate and reference of the links in, wheel torques out."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
-from fourbar_ros.control.allocation import allocate, controllable, mobilities
-from fourbar_ros.control.branch import LINKS_ALONE
+from fourbar_ros.control.allocation import Allocation, make_allocation
+from fourbar_ros.control.allocation_solver import allocate, controllable, MotorState
+from fourbar_ros.control.branch import UNPAIRED_AXES
 from fourbar_ros.control.computed_torque import (
-    axes_of,
-    BRANCH_A,
-    BRANCH_ANGLE,
-    BRANCH_B,
-    BRANCH_INERTIA,
-    BRANCH_RATE,
+    AXES_FIELDS,
     demanded,
-    HOLD,
-    TERMS,
+    ETA,
+    evaluate_axes,
+    Feedback,
+    MOTION_FIELDS,
 )
 from fourbar_ros.control.null_space import null_torques, target_speeds, towards
+from fourbar_ros.control.records import Fields, Record, records
 from fourbar_ros.control.reference_generator import ReferenceGenerator
 from fourbar_ros.control.settings import ControllerSettings
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism import Mechanism
-from fourbar_ros.mechanism.constants import Array
-from fourbar_ros.mechanism.motors import available_torque, motors_of
+from fourbar_ros.mechanism.constants import Array, Constants
+from fourbar_ros.mechanism.motors import available_torque, Motors, motors_of
 import numpy as np
 from numpy.typing import NDArray
 
 AXES = ('a', 'b', 'c', 'd')
+"""Names of the axes by link: a and b, or the first link of each pair."""
+
+MOTOR_SHARE = {'effort': 0.98, 'velocity': 0.85}
 """
-Axes by the links that they are named after: a and b; where links turn in pairs, the first of each.
+Share of the motor limit that is available to the allocator, by kind of command.
+
+The speed loop in the motor's electronics needs a reserve: at the limit its integral is reset.
 """
 
-# Of what a motor can give, so much is shared out. The loop that follows speeds needs room: in the
-# limit it forgets what it has learnt.
-SHARED_OUT = {'effort': 0.98, 'velocity': 0.85}
-
-# A wheel is not driven so that it would reach its speed limit sooner than this [s].
 HORIZON = 0.1
+"""
+Shortest time in which a held torque may bring a wheel to its speed limit [s].
 
-# Numbers of the law as the kernel takes them.
-(STIFFNESS, DAMPING, BAND, COMPENSATED, BRANCH_STIFFNESS, BRANCH_DAMPING, WHEEL_BANDWIDTH,
- STICKING) = range(8)
+It is far above the control period and the motor lag, so that the limit is not overrun.
+"""
+
+INPUT_FIELDS: Fields = [
+    *MOTION_FIELDS,
+    ('reference_accelerations', float, (4,)),   # rad/s^2, only those of the axes count
+    ('disturbance', float, (2,)),               # N m, on links a and b besides the wheels
+    ('wheel_speeds', float, (4,)),              # rad/s, relative to the links
+    ('bearing_friction', float, (4,)),          # N m, against the speeds
+    ('target_speeds', float, (4,)),             # rad/s, absolute, of the null-space control
+    ('sticking', float, ()),                    # 0 in motion to 1 at rest, see Feedback
+]
+"""Fields of the record of the inputs of a tick."""
+
+GAIN_FIELDS: Fields = [
+    ('stiffness', float, ()),                   # 1/s^2
+    ('damping', float, ()),                     # 1/s
+    ('rest_band', float, ()),                   # rad
+    ('disturbance_compensation', float, ()),    # share
+    ('branch_stiffness', float, ()),            # 1/s^2
+    ('branch_damping', float, ()),              # 1/s
+    ('wheel_bandwidth', float, ()),             # rad/s, 0 without a target of the wheel speeds
+    ('motor_share', float, ()),                 # see MOTOR_SHARE
+    ('null_weights_inv', float, (4,)),          # inverse weights of the null-space control
+]
+"""Fields of the record of the gains."""
+
+OUTPUT_FIELDS: Fields = [
+    ('torques', float, (4,)),                   # N m, on wheels and links, bearings apart
+    ('planned', float, (4,)),                   # N m, part of the reference acceleration alone
+    ('lower', float, (4,)),                     # N m, bounds of the torques
+    ('upper', float, (4,)),
+    ('scale', float, ()),                       # share of the demand that the motors can meet
+]
+"""Fields of the record of the outputs."""
 
 
-@dataclass(eq=False)
-class Decision:
+class LawOutput:
     """
-    What the law decided last; the arrays are written anew at each tick.
+    Output of the law at the last tick; the arrays are overwritten at each tick.
 
-    :param torques: (4,) that act on wheels and links alike, bearings apart [N m].
-    :param planned: (4,) of these, what the reference alone asks for [N m].
-    :param rows: (3, 4) G and, where links turn in pairs, the row of eta.
-    :param terms: see axes.
-    :param scale: share of what was asked for that the motors can give.
-    :param lower, upper: (4,) what they could give [N m].
+    :ivar axes: the record of the axes, see `computed_torque.AXES_FIELDS`.
+    :ivar torques: (4,) on wheels and links, bearings apart [N m].
+    :ivar planned: (4,) torques for the reference acceleration alone [N m].
+    :ivar lower, upper: (4,) bounds of the torques [N m].
     """
 
-    torques: Array = field(default_factory=lambda: np.zeros(4))
-    planned: Array = field(default_factory=lambda: np.zeros(4))
-    rows: Array = field(default_factory=lambda: np.zeros((3, 4)))
-    terms: Array = field(default_factory=lambda: np.zeros(TERMS))
-    lower: Array = field(default_factory=lambda: np.zeros(4))
-    upper: Array = field(default_factory=lambda: np.zeros(4))
-    scale: float = 1.0
+    def __init__(self) -> None:
+        self.records, self.axes_records = records(OUTPUT_FIELDS), records(AXES_FIELDS)
+        self.axes: Record = self.axes_records[0]
+        self.torques: Array = self.records['torques'][0]
+        self.planned: Array = self.records['planned'][0]
+        self.lower: Array = self.records['lower'][0]
+        self.upper: Array = self.records['upper'][0]
 
     @property
-    def hold(self) -> float:
-        """How much of the hold on the branch there is."""
-        return float(self.terms[HOLD])
+    def scale(self) -> float:
+        """Share of the demand that the motors can meet."""
+        return float(self.records['scale'][0])
 
 
 @kernel
-def motor_bounds(speeds: Array, friction: Array, share: float, boxed: NDArray[np.record],
-                 lower: Array, upper: Array) -> None:
+def motor_bounds(speeds: Array, friction: Array, share: float, motors: Motors, lower: Array,
+                 upper: Array) -> None:
     """
-    Evaluate what the motors can give now, friction of the bearings deducted.
+    Evaluate the torques that the motors can give now, bearing friction deducted.
 
     :param speeds: (4,) relative to the links [rad/s].
-    :param friction: (4,) what the bearings take, against the speed [N m].
-    :param share: of it that is shared out.
-    :param lower, upper: (4,) receive it; zero is always between them [N m].
+    :param friction: (4,) of the bearings, against the speed [N m].
+    :param share: share of the motor limits that is available.
+    :param lower, upper: (4,) receive the bounds, `lower <= 0 <= upper` [N m].
     """
-    motors = boxed[0]
     for j in range(4):
         limit = motors.torque_limit[j]
         low = share * available_torque(j, -limit, speeds[j], motors) - friction[j]
@@ -96,153 +123,155 @@ def motor_bounds(speeds: Array, friction: Array, share: float, boxed: NDArray[np
 
 
 @kernel
-def decide(angles: Array, rates: Array, reference_angles: Array, reference_rates: Array,
-           accelerations: Array, disturbance: Array, wanted_speeds: Array, speeds: Array,
-           numbers: Array, paired: bool, twins: NDArray[np.int64], boxed: NDArray[np.record],
-           mobilities: Array, free_mobilities: Array, bounded: bool, lower: Array, upper: Array,
-           rows: Array, terms: Array, torques: Array, planned: Array) -> float:
+def track(inputs: Record, gains: Record, rule: Record, plan_rule: Record,
+          constants: Constants, motors: Motors, axes: Record, output: Record) -> None:
     """
-    Decide on the torques of the wheels.
+    Evaluate the law.
 
-    :param angles, rates: (4,) of the links, estimated [rad], [rad/s].
-    :param reference_angles, reference_rates: (4,) [rad], [rad/s].
-    :param accelerations: (4,) of the reference [rad/s^2]; those of the axes count.
-    :param disturbance: (2,) torques on links a and b besides those of the wheels [N m].
-    :param paired, twins: see axes.axes_of; of links alone, the axes come first in twins.
-    :param wanted_speeds: (4,) where the freedom that moves no link leads the wheels [rad/s].
-    :param speeds: (4,) of the wheels, absolute [rad/s].
-    :param mobilities: (4,) see allocation.
-    :param free_mobilities: (4,) likewise, for the freedom that moves no link.
-    :param lower, upper: (4,) of the torques [N m].
-    :returns: share of what was asked for that the motors can give.
+    :param inputs: see `INPUT_FIELDS`.
+    :param gains: see `GAIN_FIELDS`.
+    :param rule: of the allocation, see `allocation_solver.RULE_FIELDS`.
+    :param plan_rule: likewise, for the torques of the reference alone.
+    :param axes: receives `computed_torque.AXES_FIELDS`.
+    :param output: receives `OUTPUT_FIELDS`.
     """
-    errors, bias, demand = np.empty((2, 2)), np.empty(3), np.empty(3)
-    axes_of(angles, rates, reference_angles, reference_rates, paired, twins, boxed, rows, errors,
-            bias, terms)
-    acceleration, pushed = np.empty(2), np.zeros(2)
+    speeds = inputs.wheel_speeds
+    motor_bounds(
+        speeds, inputs.bearing_friction, gains.motor_share, motors, output.lower, output.upper)
+    bounds = MotorState(output.lower, output.upper, speeds)
+    evaluate_axes(inputs, constants, axes)
+    demand, acceleration, disturbance = np.empty(3), np.empty(2), np.zeros(2)
     for axis in range(2):
-        acceleration[axis] = accelerations[twins[axis]]
-        # Links a and b are on axes of their own, or twins.
-        pushed[0 if twins[2] == axis else axis] += numbers[COMPENSATED] * disturbance[axis]
-    plain = np.zeros((2, 2))
-    demanded(acceleration, plain, 0.0, 0.0, 0.0, np.zeros(2), 0.0, bias, terms, demand)
-    allocate(rows[:2], demand[:2], mobilities, lower, upper, False, planned)
-    demanded(acceleration, errors, numbers[STIFFNESS], numbers[DAMPING], numbers[BAND],
-             pushed, numbers[STICKING], bias, terms, demand)
+        acceleration[axis] = inputs.reference_accelerations[inputs.paired_links[axis]]
+        # Links a and b are on different axes, or both in the first pair.
+        disturbance[0 if inputs.paired_links[2] == axis else axis] += (
+            gains.disturbance_compensation * inputs.disturbance[axis])
+    two_axes, torques = axes.wheel_map[:2], output.torques
+    demanded(acceleration, Feedback(np.zeros((2, 2)), 0.0, 0.0, 0.0, 0.0, np.zeros(2)), axes,
+             demand)
+    allocate(plan_rule, two_axes, demand[:2], bounds, output.planned)
+    demanded(acceleration, Feedback(axes.errors, gains.stiffness, gains.damping, gains.rest_band,
+                                    inputs.sticking, disturbance), axes, demand)
     usable = 0
     for j in range(4):
-        usable += mobilities[j] > 0.0
-    hold = terms[HOLD] if usable > 2 else 0.0
-    scale = allocate(rows[:2], demand[:2], mobilities, lower, upper, bounded, torques)
+        usable += rule.weights_inv[j] > 0.0
+    hold = axes.hold if usable > 2 else 0.0
+    output.scale = allocate(rule, two_axes, demand[:2], bounds, torques)
     if hold > 0.0:
         present = 0.0
         for j in range(4):
-            present += rows[2, j] * torques[j]
-        eta = -(numbers[BRANCH_STIFFNESS] * terms[BRANCH_ANGLE]
-                + numbers[BRANCH_DAMPING] * terms[BRANCH_RATE])
-        asked = demand[2] + terms[BRANCH_INERTIA] * eta
-        demand[0] += hold * terms[BRANCH_A] * eta
-        demand[1] += hold * terms[BRANCH_B] * eta
-        demand[2] = hold * asked - (1.0 - hold) * present
-        scale = allocate(rows, demand, mobilities, lower, upper, bounded, torques)
-    if numbers[WHEEL_BANDWIDTH] > 0.0:
+            present += axes.wheel_map[ETA, j] * torques[j]
+        eta = -(gains.branch_stiffness * axes.eta + gains.branch_damping * axes.eta_rate)
+        full = demand[ETA] + axes.eta_row[ETA] * eta
+        demand[0] += hold * axes.eta_row[0] * eta
+        demand[1] += hold * axes.eta_row[1] * eta
+        demand[ETA] = hold * full - (1.0 - hold) * present
+        output.scale = allocate(rule, axes.wheel_map, demand, bounds, torques)
+    if gains.wheel_bandwidth > 0.0:
         free, held = np.zeros(4), np.zeros(4)
-        wanted = towards(
-            speeds, wanted_speeds, boxed[0].flywheel_inertias, numbers[WHEEL_BANDWIDTH])
-        null_torques(rows[:2], free_mobilities, wanted, lower, upper, torques, free)
+        desired = towards(speeds + inputs.rates, inputs.target_speeds,
+                          constants.flywheel_inertias, gains.wheel_bandwidth)
+        null_torques(two_axes, gains.null_weights_inv, desired, bounds, torques, free)
         if hold > 0.0:
-            null_torques(rows, free_mobilities, wanted, lower, upper, torques, held)
+            null_torques(axes.wheel_map, gains.null_weights_inv, desired, bounds, torques, held)
         for j in range(4):
             torques[j] += (1.0 - hold) * free[j] + hold * held[j]
-    return scale
+
+
+@kernel
+def _track(inputs: NDArray[np.record], gains: NDArray[np.record], rule: NDArray[np.record],
+           plan_rule: NDArray[np.record], constants: NDArray[np.record],
+           motors: NDArray[np.record], axes: NDArray[np.record], output: NDArray[np.record]
+           ) -> None:
+    track(inputs[0], gains[0], rule[0], plan_rule[0], constants[0], motors[0], axes[0],
+          output[0])
 
 
 class TrackingLaw:
     """
-    The law with its room to work in.
+    The law with its gains and records.
 
-    :param mechanism: the linkage that the controller believes in.
-    :ivar decision: what was decided last.
+    :param mechanism: the model of the linkage.
+    :ivar output: of the last tick.
     :ivar usable: (4,) bool, wheels that may be used; see :meth:`tune`.
-    :ivar mobilities: (4,) metric of the allocation, 0 for a wheel that is not used.
-    :ivar share: of what the motors can give, that is shared out.
+    :ivar allocation: the rule, with these wheels.
+    :ivar motor_share: share of the motor limits that is available to the allocator.
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
-        self.decision = Decision()
+        self.output = LawOutput()
         self.usable = np.ones(4, dtype=bool)
-        self.mobilities = np.zeros(4)
-        self.share = 1.0
+        self.allocation: Allocation
+        self.motor_share = 1.0
         self._mechanism = mechanism
         self._constants = np.array([mechanism.with_rigid_joints().constants])
         self._motors = np.array([motors_of(mechanism)])
-        self._numbers = np.zeros(8)
-        self._free_mobilities = np.zeros(4)
-        self._bounded = False
-        self._twins = LINKS_ALONE
+        self._gains = records(GAIN_FIELDS)
+        self._inputs = records(INPUT_FIELDS)
+        self._fields = {name: self._inputs[name][0] for name, _, shape in INPUT_FIELDS if shape}
+        self._plan_rule: NDArray[np.record]
         self._target = 'free'
         self._bias = 0.0
-        self._wanted_speeds = np.zeros(4)
 
     def tune(self, settings: ControllerSettings, usable: NDArray[np.bool_]) -> None:
         """
-        Take over gains and the wheels that may be used (4,).
+        Apply gains, and the wheels that may be used (4,).
 
-        :raises AllocationError: there is no such allocation.
+        :raises AllocationError: the allocation is unknown.
         """
         inertias = self._mechanism.flywheel_inertias
-        self.mobilities = mobilities(settings.allocation, inertias, usable)
-        self._free_mobilities = mobilities('min_energy', inertias, usable)
-        self._bounded = settings.allocation == 'bounded'
-        self.share = SHARED_OUT[settings.command]
+        self.allocation = make_allocation(settings.allocation, inertias, usable)
+        self._plan_rule = self.allocation.for_plan(0.0, np.full(4, np.inf)).rule
+        self.motor_share = MOTOR_SHARE[settings.command]
         self.usable = usable
-        numbers = self._numbers
-        numbers[STIFFNESS] = settings.bandwidth ** 2
-        numbers[DAMPING] = 2.0 * settings.damping * settings.bandwidth
-        numbers[BAND] = settings.rest_band
-        numbers[COMPENSATED] = settings.disturbance_compensation
-        numbers[BRANCH_STIFFNESS] = settings.branch_bandwidth ** 2
-        numbers[BRANCH_DAMPING] = 2.0 * settings.branch_bandwidth
         self._target, self._bias = settings.wheel_target, settings.wheel_bias
-        numbers[WHEEL_BANDWIDTH] = settings.wheel_bandwidth if self._target != 'free' else 0.0
+        self._gains[0] = (
+            settings.bandwidth ** 2, 2.0 * settings.damping * settings.bandwidth,
+            settings.rest_band, settings.disturbance_compensation, settings.branch_bandwidth ** 2,
+            2.0 * settings.branch_bandwidth,
+            settings.wheel_bandwidth if self._target != 'free' else 0.0, self.motor_share,
+            make_allocation('min_energy', inertias, usable).weights_inv)
 
-    def decide(self, guide: ReferenceGenerator, angles: Array, rates: Array, disturbance: Array,
-               wheel_speeds: Array, friction: Array, sticking: float) -> Decision:
+    def update(self, reference: ReferenceGenerator, angles: Array, rates: Array,
+               disturbance: Array, wheel_speeds: Array, friction: Array, sticking: float
+               ) -> LawOutput:
         """
-        Decide on the torques.
+        Evaluate the law at a tick.
 
-        :param guide: where the links should be.
+        :param reference: of the links.
         :param angles, rates: (4,) of the links, estimated [rad], [rad/s].
         :param disturbance: (2,) torques on links a and b besides those of the wheels [N m].
         :param wheel_speeds: (4,) relative to the links [rad/s].
-        :param friction: (4,) that the bearings take [N m].
-        :param sticking: from 0, in motion, to 1, at rest; see axes.demanded.
-        :returns: the decision, whose arrays are written anew at the next one.
+        :param friction: (4,) of the bearings [N m].
+        :param sticking: from 0, in motion, to 1, at rest; see `computed_torque.Feedback`.
+        :returns: the output, whose arrays are overwritten at the next tick.
         """
-        found, numbers = self.decision, self._numbers
-        numbers[STICKING] = sticking
-        self._twins = LINKS_ALONE if guide.branch is None else guide.branch.twins
-        wanted = self._wanted_speeds
+        branch, fields = reference.branch, self._fields
+        fields['angles'][:], fields['rates'][:] = angles, rates
+        fields['reference_angles'][:] = reference.angles
+        fields['reference_rates'][:] = reference.rates
+        fields['reference_accelerations'][:] = reference.accelerations
+        fields['disturbance'][:] = disturbance
+        fields['wheel_speeds'][:], fields['bearing_friction'][:] = wheel_speeds, friction
+        fields['paired_links'][:] = UNPAIRED_AXES if branch is None else branch.paired_links
         if self._target in ('zero', 'bias'):
-            wanted = target_speeds(self._target, rates, self._bias)
-        motor_bounds(
-            wheel_speeds, friction, self.share, self._motors, found.lower, found.upper)
-        found.scale = decide(
-            angles, rates, guide.angles, guide.rates, guide.accelerations, disturbance, wanted,
-            wheel_speeds + rates, numbers, guide.paired, self._twins, self._constants,
-            self.mobilities, self._free_mobilities, self._bounded, found.lower, found.upper,
-            found.rows, found.terms, found.torques, found.planned)
-        return found
+            fields['target_speeds'][:] = target_speeds(self._target, rates, self._bias)
+        else:
+            fields['target_speeds'][:] = 0.0
+        self._inputs['paired'], self._inputs['sticking'] = reference.paired, sticking
+        _track(self._inputs, self._gains, self.allocation.rule, self._plan_rule, self._constants,
+               self._motors, self.output.axes_records, self.output.records)
+        return self.output
 
     @property
     def axes(self) -> NDArray[np.int64]:
-        """Return the links after which the axes of the last decision are named (2,)."""
-        axes: NDArray[np.int64] = self._twins[:2]
+        """Links that the axes of the last tick are named after (2,)."""
+        axes: NDArray[np.int64] = self._fields['paired_links'][:2]
         return axes
 
     def lost_axes(self) -> list[str]:
-        """Name the axes that the wheels can not drive."""
-        rows = self.decision.rows[:2]
-        directions, shares = controllable(rows, self.mobilities)
-        return [AXES[self._twins[int(np.argmax(np.abs(direction)))]]
+        """Return the names of the axes that the wheels cannot drive."""
+        directions, shares = controllable(
+            self.output.axes.wheel_map[:2], self.allocation.weights_inv)
+        return [AXES[self.axes[int(np.argmax(np.abs(direction)))]]
                 for direction, share in zip(directions, shares) if share < 1.0]

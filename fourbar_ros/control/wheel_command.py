@@ -1,14 +1,13 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""From the torques that shall act to what the wheels are told: torques, or speeds."""
+"""Wheel commands, torques or speeds, that make the torques of the law act."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from math import copysign
 
-from fourbar_ros.control.settings import ControllerSettings
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, Mechanism
 from fourbar_ros.mechanism.constants import Array
@@ -16,23 +15,30 @@ from fourbar_ros.mechanism.motors import SPEED_BANDWIDTH
 import numpy as np
 from numpy.typing import NDArray
 
-# A commanded speed is kept this near to the measured one, as a share of what makes the motor's
-# own loop ask for all it has: what is beyond adds up to nothing but a late overshoot.
-REACH = 0.8
+SPEED_REACH = 0.8
+"""
+Largest distance of a commanded speed from the measured one.
 
-# Up to this speed a bearing's friction takes less than all of its Coulomb friction [rad/s]: the
-# sign of a slower wheel is that of its encoder's rounding.
-UNSURE = 0.5
+It is a share of the distance at which the motor's speed loop asks for its torque limit. Beyond
+that the command winds up and causes a late overshoot.
+"""
+
+FRICTION_SPEED = 0.5
+"""
+Speed below which the compensated Coulomb friction fades out [rad/s].
+
+The sign of a slower wheel is the rounding error of its encoder.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class WheelCommand:
     """
-    What the wheels are told.
+    Command to the wheels.
 
     :param values: (4,) torques [N m], or speeds relative to the links [rad/s].
-    :param by_speed: which of both.
-    :param powered: (4,) bool; a wheel without power is not named in the command.
+    :param by_speed: whether the values are speeds.
+    :param powered: (4,) bool; a wheel without power is left out of the command message.
     """
 
     values: Array
@@ -42,39 +48,39 @@ class WheelCommand:
 
 class WheelCommander:
     """
-    Turns torques into commands.
+    Turns torques of the law into commands.
 
-    Speeds are followed by the motors' own electronics, whatever their bearings take: the wheel
-    gains the momentum that it is told to gain. Torques need the friction added.
+    Under speed commands the loop in the motor's electronics overcomes the bearing friction: the
+    wheel gains the commanded momentum. To torque commands the friction is added.
 
-    :param mechanism: the linkage that the controller believes in.
+    :param mechanism: the model of the linkage.
+    :ivar friction: (4,) of the bearings at the last tick, against the speeds [N m].
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
         self.friction = np.zeros(4)
         self._inertias = mechanism.flywheel_inertias
-        self._reach = REACH * mechanism.motor_torque_limits / (
+        self._reach = SPEED_REACH * mechanism.motor_torque_limits / (
             SPEED_BANDWIDTH * mechanism.flywheel_inertias)
         self._limits = mechanism.motor_torque_limits
         self._speeds = np.zeros(4)
 
-    def begin(self, speeds: Array) -> None:
-        """Start from the measured speeds [rad/s]."""
+    def reset(self, speeds: Array) -> None:
+        """Start from the measured speeds (4,) [rad/s]."""
         self._speeds[:] = speeds
 
-    def look(self, speeds: Array, settings: ControllerSettings) -> Array:
-        """Work out what the bearings take, against the speeds (4,) [N m]."""
-        bearing_friction(speeds, settings.bearing_coulomb, settings.bearing_viscous,
-                         self.friction)
+    def update_friction(self, speeds: Array, coulomb: float, viscous: float) -> Array:
+        """Evaluate the bearing friction at measured speeds, against them (4,) [N m]."""
+        bearing_friction(speeds, coulomb, viscous, self.friction)
         return self.friction
 
     def command(self, torques: Array, link_accelerations: Array, speeds: Array,
                 powered: NDArray[np.bool_], period: float, by_speed: bool) -> WheelCommand:
         """
-        Command what makes torques act.
+        Return the command that makes torques act.
 
         :param torques: (4,) on the wheels, bearings apart [N m].
-        :param link_accelerations: (4,) that are asked for [rad/s^2].
+        :param link_accelerations: (4,) of the reference [rad/s^2].
         :param speeds: (4,) measured, relative to the links [rad/s].
         :param powered: (4,) bool, wheels that may be driven.
         :param period: to the next command [s].
@@ -90,9 +96,9 @@ class WheelCommander:
 
 def by_name(command: WheelCommand) -> tuple[tuple[str, ...], list[float], list[float]]:
     """
-    Write a command as its message has it.
+    Return the fields of the message of a command.
 
-    :returns: the wheels that have power, and for these either velocities or efforts.
+    :returns: names of the wheels with power, and either their velocities or their efforts.
     """
     names: tuple[str, ...] = FLYWHEEL_NAMES
     values = command.values.tolist()
@@ -105,9 +111,9 @@ def by_name(command: WheelCommand) -> tuple[tuple[str, ...], list[float], list[f
 
 @kernel
 def bearing_friction(speeds: Array, coulomb: float, viscous: float, friction: Array) -> None:
-    """Evaluate what bearings take of the torque (4,) [N m], see :class:`WheelCommander`."""
+    """Evaluate the bearing friction (4,) [N m], see :class:`WheelCommander`."""
     for j in range(4):
-        sign = copysign(min(abs(speeds[j]) / UNSURE, 1.0), speeds[j])
+        sign = copysign(min(abs(speeds[j]) / FRICTION_SPEED, 1.0), speeds[j])
         friction[j] = coulomb * sign + viscous * speeds[j]
 
 
@@ -119,5 +125,5 @@ def next_speeds(commanded: Array, torques: Array, link_accelerations: Array, spe
         if not powered[j]:
             commanded[j] = speeds[j]
             continue
-        wanted = commanded[j] + period * (torques[j] / inertias[j] - link_accelerations[j])
-        commanded[j] = min(max(wanted, speeds[j] - reach[j]), speeds[j] + reach[j])
+        speed = commanded[j] + period * (torques[j] / inertias[j] - link_accelerations[j])
+        commanded[j] = min(max(speed, speeds[j] - reach[j]), speeds[j] + reach[j])

@@ -2,19 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Which wheels still do what they are told: command against measured speed and effort.
+Fault detection and isolation for the wheels, from commands, measured speeds and efforts.
 
-Beside each wheel runs a model of a healthy one under the same commands. What the wheel does not
-follow adds up to a difference of speeds, and a large one means that it is broken; what the motor
-says that it gives, and what the wheel makes of it, tell how. Smaller faults, with which a wheel is
-still of use, show as torque that is lost on the way from command to effort or from effort to
-acceleration, or as a motor that acts late.
+A model of a healthy wheel runs beside each wheel under the same commands. The residual is the
+measured speed less that of the model. A residual beyond its threshold for several ticks means
+that the wheel is broken; the effort that the motor reports and the resulting change of momentum
+isolate the fault. Degradation, with which a wheel is still usable, shows as torque that is lost
+between command and effort, or between effort and acceleration, or as a delay of the motor.
 """
 
 from __future__ import annotations
 
 from math import copysign, exp, inf, nan
+from typing import NamedTuple
 
+from fourbar_ros.control.records import Fields, Record, records
+from fourbar_ros.control.wheel_command import WheelCommand
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, Mechanism
 from fourbar_ros.mechanism.constants import Array
@@ -29,398 +32,533 @@ from fourbar_ros.mechanism.motors import (
 import numpy as np
 from numpy.typing import NDArray
 
-VERDICTS = ('healthy', 'degraded', 'dead', 'stuck', 'runaway', 'shorted')
-"""What may be said of a wheel; the number in arrays is the index. From `dead` on it is out."""
+FAULT_STATES = ('healthy', 'degraded', 'dead', 'stuck', 'runaway', 'shorted')
+"""Fault states of a wheel; arrays hold the index. From `dead` on a wheel is not used any more."""
 
-HEALTHY, DEGRADED, DEAD, STUCK, RUNAWAY, SHORTED = range(len(VERDICTS))
+HEALTHY, DEGRADED, DEAD, STUCK, RUNAWAY, SHORTED = range(len(FAULT_STATES))
 
-# A wheel that is so much faster or slower than it should be [rad/s], for so many ticks in a row,
-# is broken or degraded.
-UNFOLLOWED = 2.5
-UNFOLLOWED_TICKS = 4
-# So much more is allowed [rad/s] of a motor that was strained so lately [s]: what its own loop
-# does in the limit is known less well.
-OF_STRAINED, JUST_STRAINED = 10.0, 0.3
-# And of a slow wheel that is driven by torque, which static friction holds back more [rad/s]; its
-# model is led back sooner [s].
-OF_SLOW, SOON = 1.5, 2.0
+# Detection of a broken wheel
 
-# Time constants of means [s]: for a wheel that breaks, and for one that degrades; with which a
-# healthy one is learnt, and models of a wheel and its loop are led back to it, since errors add
-# up there.
-SHORT, LONG, SLOW, VERY_SLOW = 0.02, 0.5, 5.0, 30.0
+RESIDUAL_LIMIT = 2.5
+"""Largest residual of a healthy wheel [rad/s]."""
 
-# In shares of the motor's torque limit, or of so many times its friction if that is more:
-# degradation is looked at from this effort on; torque that friction takes; a motor that gives
-# nothing; one that gives what nobody asked for; a brake.
+RESIDUAL_TICKS = 4
+"""Consecutive ticks beyond the limit after which a wheel is not healthy."""
+
+STRAINED_ALLOWANCE, STRAINED_RECENTLY = 10.0, 0.3
+"""
+Extra residual [rad/s] of a motor that was near its limit within this time [s].
+
+The speed loop in its electronics is known less well at the limit.
+"""
+
+SLOW_ALLOWANCE, SLOW_RESET = 1.5, 2.0
+"""
+Extra residual [rad/s] of a slow wheel under torque commands, which static friction holds back.
+
+Its model is led back to the wheel with this time constant [s].
+"""
+
+MEAN_TIME, LONG_MEAN_TIME = 0.02, 0.5
+"""Time constants of the means for a broken and for a degraded wheel [s]."""
+
+LEARNING_TIME, SLOW_LEARNING_TIME = 5.0, 30.0
+"""
+Time constants for learning the usual friction loss, and for leading models back [s].
+
+Models of a wheel and of its speed loop drift, since they integrate errors. The slow one applies
+to a loss that is already half of what is reported.
+"""
+
+# Thresholds as shares of the torque limit, or of FRICTIONS times the Coulomb friction if larger.
+
 FRICTIONS = 50.0
-LOOKED_AT, FRICTION_LOSS, NOTHING, UNASKED, BRAKED = 0.04, 8e-4, 2e-3, 0.04, 0.1
+MIN_EFFORT = 0.04
+"""Smallest mean effort at which degradation is judged."""
 
-# Shares of the expected torque: that of a dead motor at most, and what a healthy one may lack; of
-# the measured change of torque, by how much the inertia of a wheel may be believed wrongly.
-DEAD_SHARE, MISSING, INERTIA_ERROR = 0.15, 0.2, 0.06
-# Of what a motor's own loop asks for a replica knows less, since it sees the speed less often.
-MISSING_BY_SPEED = 0.25
+FRICTION_LOSS = 8e-4
+"""Increase of the friction loss that is degradation."""
 
-# A wheel that follows speeds is late if it is so far behind on the mean [rad/s]; one that follows
-# torques, if some delay explains its effort better than none by this factor, in squares, and the
-# difference is more than this share, as above.
-BEHIND, EXPLAINED_BETTER, VISIBLE = 0.35, 4.0, 5e-4
+NO_TORQUE = 2e-3
+"""Largest effort of a motor that gives none."""
 
-# Degradation must last so long to be said [s], and is not looked at while the motor gives more
-# than this share of its limit, nor for so long afterwards [s].
-PERSISTENT, STRAINED, AFTER_STRAIN = 0.5, 0.5, 2.0
-# Nor for so long after another wheel broke [s].
-AFTER_BREAK = 3.0
+UNCOMMANDED = 0.04
+"""Effort beyond the expected from which a wheel is called runaway."""
 
-# The friction of slower wheels is not known [rad/s], nor that of one which was slow so lately [s].
-SLOWEST, AFTER_SLOW = 5.0, 0.8
+BRAKED = 0.1
+"""Lost torque from which a wheel is called stuck."""
 
-# At most this slow, a wheel that is pushed stands still [rad/s].
-STANDING = 1.0
+# Thresholds as shares of the expected torque.
 
-# A wheel without power that is driven after so long cannot be cut [s].
-CUT_WITHIN = 0.15
+DEAD_SHARE = 0.15
+"""Largest effort of a dead motor."""
 
-# Delays of commands that are thought of, in ticks: from the first to the last.
+MISSING, MISSING_BY_SPEED = 0.2, 0.25
+"""
+Torque that a healthy motor may lack under torque and under speed commands.
+
+A replica of the motor's speed loop is less exact, since it sees the speed less often.
+"""
+
+INERTIA_ERROR = 0.06
+"""Share by which the inertia of a wheel may be wrong in the model."""
+
+# Thresholds of a delayed motor
+
+DELAY_RESIDUAL = 0.35
+"""Mean residual of a delayed wheel under speed commands [rad/s]."""
+
+DELAY_RATIO, DELAY_VISIBLE = 4.0, 5e-4
+"""
+Under torque commands, ratio of mean squared errors without delay and with the best delay.
+
+The error without delay must also exceed this share of the torque limit.
+"""
+
 FIRST_DELAY, DELAYS = 3, 32
+"""First delay hypothesis [ticks], and number of ticks that are kept."""
 
-# The loop in the motor's electronics is taken to see the speed as often as this [s].
+# Conditions
+
+DEGRADED_TIME = 0.5
+"""Time for which degradation must last before it is reported [s]."""
+
+STRAINED, STRAINED_PAUSE = 0.5, 2.0
+"""Degradation is not judged above this share of the torque limit, nor for this time after [s]."""
+
+BROKEN_PAUSE = 3.0
+"""
+Degradation is not judged for this time after another wheel broke [s].
+
+The others then give torques that they never gave before.
+"""
+
+MIN_SPEED, MIN_SPEED_TIME = 5.0, 0.8
+"""Friction is judged above this speed [rad/s], held for this time [s]."""
+
+STANDING = 1.0
+"""Largest speed of a wheel that stands still although it is driven [rad/s]."""
+
+CUT_TIME = 0.15
+"""Time after the power cut in which a wheel must be undriven [s]; a shorted one is not."""
+
+# Models
+
 LOOP_STEP = 5e-4
+"""Assumed period of the speed loop in the motor's electronics [s]."""
 
-# Longest step of the model [s].
-STEP = 1e-3
+MODEL_STEP = 1e-3
+"""Longest integration step of the model [s]."""
 
-# What is kept of each wheel.
-(MODEL_SPEED, MODEL_TORQUE, INTEGRAL, LAST_SPEED, LAST_RATE, AGAINST, EFFORT, EXPECTED, GAIN,
- LONG_EFFORT, LONG_EXPECTED, LONG_GAIN, LONG_BEHIND, LEARNT, LEARNT_GAIN, REPLICA, REPLICA_TORQUE,
- SUSPECT_FOR, FAST_FOR, CUT_FOR, KNOWN, LOST, SETTLED) = range(23)
-COLUMNS = 23
+SAMPLE_FIELDS: Fields = [
+    ('period', float, ()),              # s
+    ('commands', float, (4,)),          # N m or rad/s
+    ('by_speed', np.int64, ()),         # 1 for speeds, 0 for torques
+    ('powered', np.int64, (4,)),        # 1 for a wheel with power
+    ('speeds', float, (4,)),            # rad/s, relative to the links, mean of the period
+    ('link_rates', float, (4,)),        # rad/s, at its end
+    ('efforts', float, (4,)),           # N m, reported by the motors, mean of the period
+    ('coulomb', float, ()),             # N m, of the bearings
+    ('viscous', float, ()),             # N m s
+]
+"""Fields of the record of a control period."""
+
+WHEEL_FIELDS: Fields = [
+    ('model_speed', float, ()),         # rad/s
+    ('model_torque', float, ()),        # N m
+    ('model_integral', float, ()),      # N m, of its speed loop
+    ('last_speed', float, ()),          # rad/s
+    ('last_link_rate', float, ()),      # rad/s
+    ('residual_ticks', float, ()),      # consecutive ticks beyond the limit
+    # Means with MEAN_TIME:
+    ('effort', float, ()),              # N m, reported
+    ('expected', float, ()),            # N m, of the model
+    ('inertial', float, ()),            # N m, change of the wheel's momentum
+    # Means with LONG_MEAN_TIME:
+    ('long_effort', float, ()),
+    ('long_expected', float, ()),
+    ('long_inertial', float, ()),
+    ('long_residual', float, ()),       # rad/s
+    ('loss', float, ()),                # N m, of effort, beyond the known friction
+    # Learnt with LEARNING_TIME:
+    ('usual_loss', float, ()),          # N m
+    ('usual_inertial', float, ()),      # N m, at which it was learnt, along the speed
+    ('loss_known', float, ()),          # 1 once there is a usual loss
+    ('replica_integral', float, ()),    # N m, of the replica of the motor's speed loop
+    ('replica_torque', float, ()),      # N m
+    # Times of conditions:
+    ('degraded_time', float, ()),       # s, negative in a pause
+    ('turning_time', float, ()),        # s, above MIN_SPEED
+    ('cut_time', float, ()),            # s, without power
+    ('unstrained_time', float, ()),     # s
+    ('asked', float, (DELAYS,)),        # N m, torques asked for, newest first
+    ('delay_errors', float, (DELAYS,)),  # N^2 m^2, mean squares of effort less these
+    ('state', np.int64, ()),            # index of FAULT_STATES
+]
+"""Fields of the record of a wheel."""
+
+
+class _Observation(NamedTuple):
+    """
+    A wheel in a control period.
+
+    :param residual: measured speed less that of the model [rad/s].
+    :param gained: change of its speed [rad/s].
+    :param inertial: change of its momentum per time [N m].
+    :param expected: torque of the model [N m].
+    :param scale: reference of the thresholds [N m].
+    :param long: share by which long means follow.
+    """
+
+    residual: float
+    gained: float
+    inertial: float
+    expected: float
+    scale: float
+    long: float
 
 
 class WheelFaultDetector:
     """
-    Watches the four wheels.
+    Detects and isolates faults of the four wheels.
 
-    :param mechanism: the linkage, its wheels and motors.
-    :ivar verdicts: (4,) what is the matter with each wheel, as index of `VERDICTS`.
-    :ivar usable: (4,) bool, which wheels can be driven; a new array when that changes.
+    :param mechanism: the model of the linkage, its wheels and motors.
+    :ivar usable: (4,) bool, wheels that can be driven; a new array when that changes.
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
-        self.verdicts = np.zeros(4, np.int64)
         self.usable = np.ones(4, dtype=bool)
         self._motors = np.array([motors_of(mechanism)])
-        self._kept = np.zeros((4, COLUMNS))
-        self._past = np.zeros((4, DELAYS))
-        self._late = np.zeros((4, DELAYS))
+        self._sample = records(SAMPLE_FIELDS)
+        self._fields = {name: self._sample[name][0] for name, _, shape in SAMPLE_FIELDS if shape}
+        self._wheels = records(WHEEL_FIELDS, 4)
         self._started = False
 
-    def begin(self) -> None:
-        """Think well of all wheels, and know nothing of them."""
-        self.verdicts[:] = HEALTHY
+    @property
+    def fault_states(self) -> NDArray[np.int64]:
+        """Fault state of each wheel (4,), as index of `FAULT_STATES`."""
+        states: NDArray[np.int64] = self._wheels['state']
+        return states
+
+    def tune(self, bearing_coulomb: float, bearing_viscous: float) -> None:
+        """Set the friction of the bearings of the model [N m], [N m s]."""
+        self._sample['coulomb'], self._sample['viscous'] = bearing_coulomb, bearing_viscous
+
+    def reset(self) -> None:
+        """Take all wheels for healthy, and forget everything about them."""
+        self._wheels['state'] = HEALTHY
         self.usable = np.ones(4, dtype=bool)
         self._started = False
 
-    def look(self, period: float, commands: Array, by_speed: bool, powered: NDArray[np.bool_],
-             speeds: Array, link_rates: Array, efforts: Array, friction: Array) -> bool:
+    def update(self, period: float, command: WheelCommand, speeds: Array, link_rates: Array,
+               efforts: Array) -> bool:
         """
-        Look at what the wheels did in a period.
+        Evaluate a control period.
 
         :param period: its length [s].
-        :param commands: (4,) torques [N m] or speeds [rad/s] that were commanded for it.
-        :param by_speed: which of both.
-        :param powered: (4,) which wheels had power.
+        :param command: in force during it.
         :param speeds: (4,) measured, relative to the links, mean of the period [rad/s].
         :param link_rates: (4,) of the links at its end [rad/s].
-        :param efforts: (4,) that the motors say they gave, mean of the period [N m].
-        :param friction: (2,) of the bearings: Coulomb [N m] and viscous [N m s].
-        :returns: whether a verdict has changed.
+        :param efforts: (4,) reported by the motors, mean of the period [N m].
+        :returns: whether a fault state has changed.
         """
+        self._fill(period, command, speeds, link_rates, efforts)
         if not self._started:
-            _begin(self._kept, self._past, self._late, speeds, link_rates)
+            _start(self._sample, self._wheels)
             self._started = True
             return False
-        changed = look_at_wheels(
-            period, commands, by_speed, powered, speeds, link_rates, efforts, friction,
-            self._motors, self._kept, self._past, self._late, self.verdicts)
+        changed = detect(self._sample, self._motors, self._wheels)
         if changed:
-            self.usable = self.verdicts < DEAD
+            self.usable = self.fault_states < DEAD
         return bool(changed)
 
-    def lose(self, commands: Array, by_speed: bool, speeds: Array, link_rates: Array,
-             efforts: Array) -> None:
+    def restart(self, command: WheelCommand, speeds: Array, link_rates: Array, efforts: Array
+                ) -> None:
         """
-        Begin again from the wheels as they are, thinking of them as before.
+        Restart the models from the measured wheels; fault states stay.
 
-        For a period of which it is not known what the wheels were told, or that was not seen.
+        For a period with an unknown command, or one that was not observed.
 
-        :param commands, by_speed: now in force.
-        :param speeds, link_rates, efforts: as of :meth:`look`.
+        :param command: now in force.
+        :param speeds, link_rates, efforts: see :meth:`update`.
         """
         if self._started:
-            _lose(commands, by_speed, speeds, link_rates, efforts, self._motors, self._kept)
+            self._fill(0.0, command, speeds, link_rates, efforts)
+            _restart(self._sample, self._motors, self._wheels)
 
     def faults(self) -> dict[str, str]:
-        """Return what is the matter, by the name of the wheel; nothing if all are healthy."""
-        return {name: VERDICTS[verdict] for name, verdict in zip(
-            FLYWHEEL_NAMES, self.verdicts.tolist()) if verdict}
+        """Return the fault states by the name of the wheel, of wheels that are not healthy."""
+        return {name: FAULT_STATES[state] for name, state in zip(
+            FLYWHEEL_NAMES, self.fault_states.tolist()) if state}
+
+    def _fill(self, period: float, command: WheelCommand, speeds: Array, link_rates: Array,
+              efforts: Array) -> None:
+        fields = self._fields
+        self._sample['period'], self._sample['by_speed'] = period, command.by_speed
+        fields['commands'][:], fields['powered'][:] = command.values, command.powered
+        fields['speeds'][:], fields['link_rates'][:] = speeds, link_rates
+        fields['efforts'][:] = efforts
 
 
 @kernel
-def _begin(kept: Array, past: Array, late: Array, speeds: Array, rates: Array) -> None:
-    kept[:], past[:], late[:] = 0.0, 0.0, 0.0
+def _start(samples: NDArray[np.record], wheels: NDArray[np.record]) -> None:
+    sample = samples[0]
     for j in range(4):
-        kept[j, MODEL_SPEED] = kept[j, LAST_SPEED] = speeds[j]
-        kept[j, LAST_RATE], kept[j, SETTLED] = rates[j], AFTER_STRAIN
-        kept[j, INTEGRAL] = kept[j, REPLICA] = nan
+        wheel = wheels[j]
+        wheel.model_speed = wheel.last_speed = sample.speeds[j]
+        wheel.last_link_rate, wheel.unstrained_time = sample.link_rates[j], STRAINED_PAUSE
+        wheel.model_integral = wheel.replica_integral = nan
+        wheel.model_torque = wheel.residual_ticks = 0.0
+        wheel.effort = wheel.expected = wheel.inertial = 0.0
+        wheel.long_effort = wheel.long_expected = wheel.long_inertial = 0.0
+        wheel.long_residual = wheel.loss = 0.0
+        wheel.usual_loss = wheel.usual_inertial = wheel.loss_known = wheel.replica_torque = 0.0
+        wheel.degraded_time = wheel.turning_time = wheel.cut_time = 0.0
+        wheel.asked[:], wheel.delay_errors[:] = 0.0, 0.0
 
 
 @kernel
-def _lose(commands: Array, by_speed: bool, speeds: Array, rates: Array, efforts: Array,
-          boxed: NDArray[np.record], kept: Array) -> None:
-    motors = boxed[0]
+def _restart(samples: NDArray[np.record], packed: NDArray[np.record], wheels: NDArray[np.record]
+             ) -> None:
+    sample, motors = samples[0], packed[0]
     for j in range(4):
-        wheel, effort = kept[j], efforts[j]
-        wheel[MODEL_SPEED] = wheel[LAST_SPEED] = speeds[j]
-        wheel[LAST_RATE] = rates[j]
-        wheel[MODEL_TORQUE] = wheel[EXPECTED] = wheel[EFFORT] = wheel[GAIN] = effort
-        wheel[AGAINST] = wheel[SETTLED] = 0.0
-        wheel[INTEGRAL] = wheel[REPLICA] = nan
-        if by_speed:
-            # What the motor's own loop has learnt is what it gives beyond the error.
+        wheel, effort = wheels[j], sample.efforts[j]
+        wheel.model_speed = wheel.last_speed = sample.speeds[j]
+        wheel.last_link_rate = sample.link_rates[j]
+        wheel.model_torque = wheel.expected = wheel.effort = wheel.inertial = effort
+        wheel.residual_ticks = wheel.unstrained_time = 0.0
+        wheel.model_integral = wheel.replica_integral = nan
+        if sample.by_speed:
+            # The integral of the motor's speed loop is the effort beyond its proportional part.
             limit = motors.torque_limit[j]
-            learnt = effort - SPEED_BANDWIDTH * motors.inertia[j] * (commands[j] - speeds[j])
-            wheel[INTEGRAL] = min(max(learnt, -limit), limit)
+            integral = effort - SPEED_BANDWIDTH * motors.inertia[j] * (
+                sample.commands[j] - sample.speeds[j])
+            wheel.model_integral = min(max(integral, -limit), limit)
 
 
 @kernel
-def look_at_wheels(period: float, commands: Array, by_speed: bool, powered: NDArray[np.bool_],
-                   speeds: Array, rates: Array, efforts: Array, friction: Array,
-                   boxed: NDArray[np.record], kept: Array, past: Array, late: Array,
-                   verdicts: NDArray[np.int64]) -> bool:
+def detect(samples: NDArray[np.record], packed: NDArray[np.record], wheels: NDArray[np.record]
+           ) -> bool:
     """
-    Look at the wheels, see :meth:`WheelFaultDetector.look`.
+    Update the wheels, see :meth:`WheelFaultDetector.update`.
 
-    :param kept: (4, COLUMNS) of each wheel.
-    :param past: (4, DELAYS) torques that were asked for, newest first [N m].
-    :param late: (4, DELAYS) mean squares of effort less these [N^2 m^2].
+    :param samples: (1,) of `SAMPLE_FIELDS`.
+    :param packed: (1,) of the motors.
+    :param wheels: (4,) of `WHEEL_FIELDS`.
     """
-    motors, changed = boxed[0], False
-    short, long = 1.0 - exp(-period / SHORT), 1.0 - exp(-period / LONG)
-    # Where no motor gives anything, the device does not drive: commands are late, or it is
-    # disarmed and that is not known here yet. No wheel is to blame.
+    sample, motors, changed, period = samples[0], packed[0], False, samples[0].period
+    short, long = 1.0 - exp(-period / MEAN_TIME), 1.0 - exp(-period / LONG_MEAN_TIME)
+    # Where no motor gives any torque, the device does not drive: commands are late, or it was
+    # disarmed and that is not known here yet. That is no fault of a wheel.
     driving = broke = False
     for j in range(4):
-        driving |= powered[j] and abs(efforts[j]) > NOTHING * _scale(j, friction, motors)
+        driving |= sample.powered[j] != 0 and abs(
+            sample.efforts[j]) > NO_TORQUE * _scale(j, sample, motors)
     for j in range(4):
-        wheel, before = kept[j], verdicts[j]
+        wheel, before = wheels[j], wheels[j].state
         inertia, limit = motors.inertia[j], motors.torque_limit[j]
-        scale = _scale(j, friction, motors)
-        speed, turned = speeds[j], rates[j] - wheel[LAST_RATE]
-        gained = speed - wheel[LAST_SPEED]
-        gain = inertia * (gained + turned) / period
-        wheel[LAST_SPEED], wheel[LAST_RATE] = speed, rates[j]
-        wheel[EFFORT] += short * (efforts[j] - wheel[EFFORT])
-        wheel[GAIN] += short * (gain - wheel[GAIN])
-        if not powered[j]:
-            _without_power(wheel, speed, period)
-            if verdicts[j] == RUNAWAY and wheel[CUT_FOR] > CUT_WITHIN:
-                # Friction brakes it: anything else is driven.
-                if (abs(speed) > SLOWEST and copysign(1.0, speed) * wheel[GAIN] > UNASKED * scale
-                        or abs(wheel[EFFORT]) > UNASKED * scale):
-                    verdicts[j] = SHORTED
-            changed |= verdicts[j] != before
+        scale = _scale(j, sample, motors)
+        speed, turned = sample.speeds[j], sample.link_rates[j] - wheel.last_link_rate
+        gained = speed - wheel.last_speed
+        inertial = inertia * (gained + turned) / period
+        wheel.last_speed, wheel.last_link_rate = speed, sample.link_rates[j]
+        wheel.effort += short * (sample.efforts[j] - wheel.effort)
+        wheel.inertial += short * (inertial - wheel.inertial)
+        if not sample.powered[j]:
+            _follow_undriven(wheel, speed)
+            wheel.cut_time += period
+            if wheel.state == RUNAWAY and wheel.cut_time > CUT_TIME:
+                # Friction brakes the wheel: anything else is a drive.
+                if (abs(speed) > MIN_SPEED
+                        and copysign(1.0, speed) * wheel.inertial > UNCOMMANDED * scale
+                        or abs(wheel.effort) > UNCOMMANDED * scale):
+                    wheel.state = SHORTED
+            changed |= wheel.state != before
             continue
-        wheel[CUT_FOR] = 0.0
+        wheel.cut_time = 0.0
         if not driving:
-            _wait(wheel, speed)
+            _follow_undriven(wheel, speed)
             continue
-        asked, behind = _follow_model(
-            j, wheel, commands[j], by_speed, speed, turned, period, friction, boxed)
-        wheel[EXPECTED] += short * (asked - wheel[EXPECTED])
-        wheel[SETTLED] += period
-        if max(abs(wheel[EFFORT]), abs(wheel[EXPECTED])) > STRAINED * limit:
-            wheel[SETTLED] = 0.0
-        allowed = UNFOLLOWED + (OF_STRAINED if wheel[SETTLED] < JUST_STRAINED else 0.0)
-        if not by_speed and abs(speed) < SLOWEST:
-            allowed += OF_SLOW
-        wheel[AGAINST] = wheel[AGAINST] + 1.0 if abs(behind) > allowed else 0.0
-        if wheel[AGAINST] >= UNFOLLOWED_TICKS:
-            verdicts[j] = max(before, _broken(wheel, speed, scale, friction))
-            wheel[MODEL_SPEED], wheel[AGAINST] = speed, 0.0
-        if verdicts[j] == HEALTHY and _degraded(
-                j, wheel, asked, by_speed, speed, behind, efforts[j], gain, commands[j], period,
-                long, gained, friction, boxed, past[j], late[j]):
-            verdicts[j] = DEGRADED
-        changed |= verdicts[j] != before
-        broke |= before < DEAD <= verdicts[j]
+        expected, residual = _run_model(j, wheel, sample, turned, motors)
+        wheel.expected += short * (expected - wheel.expected)
+        wheel.unstrained_time += period
+        if max(abs(wheel.effort), abs(wheel.expected)) > STRAINED * limit:
+            wheel.unstrained_time = 0.0
+        allowed = RESIDUAL_LIMIT + (
+            STRAINED_ALLOWANCE if wheel.unstrained_time < STRAINED_RECENTLY else 0.0)
+        if not sample.by_speed and abs(speed) < MIN_SPEED:
+            allowed += SLOW_ALLOWANCE
+        wheel.residual_ticks = wheel.residual_ticks + 1.0 if abs(residual) > allowed else 0.0
+        if wheel.residual_ticks >= RESIDUAL_TICKS:
+            wheel.state = max(before, _isolate(wheel, speed, scale, sample))
+            wheel.model_speed, wheel.residual_ticks = speed, 0.0
+        if wheel.state == HEALTHY and _is_degraded(
+                j, wheel, sample, _Observation(residual, gained, inertial, expected, scale, long),
+                motors):
+            wheel.state = DEGRADED
+        changed |= wheel.state != before
+        broke |= before < DEAD <= wheel.state
     if broke:
-        # The others now give what they never gave before.
-        kept[:, SUSPECT_FOR] = -AFTER_BREAK
+        for j in range(4):
+            wheels[j].degraded_time = -BROKEN_PAUSE
     return changed
 
 
 @kernel
-def _scale(j: int, friction: Array, motors: Motors) -> float:
-    """Return what torques are measured against [N m]."""
-    return float(max(motors.torque_limit[j], FRICTIONS * friction[0]))
+def _scale(j: int, sample: Record, motors: Motors) -> float:
+    """Return the reference of the thresholds [N m]."""
+    return float(max(motors.torque_limit[j], FRICTIONS * sample.coulomb))
 
 
 @kernel
-def _without_power(wheel: Array, speed: float, period: float) -> None:
-    _wait(wheel, speed)
-    wheel[CUT_FOR] += period
+def _follow_undriven(wheel: Record, speed: float) -> None:
+    """Let the model follow a wheel that is not driven."""
+    wheel.model_speed, wheel.model_torque, wheel.expected = speed, 0.0, 0.0
+    wheel.model_integral = wheel.replica_integral = nan
+    wheel.residual_ticks = wheel.degraded_time = wheel.turning_time = 0.0
 
 
 @kernel
-def _wait(wheel: Array, speed: float) -> None:
-    """Let the model follow the wheel, which nobody drives."""
-    wheel[MODEL_SPEED], wheel[MODEL_TORQUE], wheel[EXPECTED] = speed, 0.0, 0.0
-    wheel[INTEGRAL] = wheel[REPLICA] = nan
-    wheel[AGAINST] = wheel[SUSPECT_FOR] = wheel[FAST_FOR] = 0.0
-
-
-@kernel
-def _follow_model(j: int, wheel: Array, command: float, by_speed: bool, speed: float,
-                  turned: float, period: float, friction: Array, boxed: NDArray[np.record]
-                  ) -> tuple[float, float]:
+def _run_model(j: int, wheel: Record, sample: Record, turned: float, motors: Motors
+               ) -> tuple[float, float]:
     """
-    Let a healthy wheel do what this one was told.
+    Advance the model of a healthy wheel by the period.
 
-    :param turned: what the link's rate gained [rad/s].
-    :returns: its mean torque [N m], and measured speed less its mean speed [rad/s].
+    :param turned: change of the link's rate [rad/s].
+    :returns: its mean torque [N m], and the residual against its mean speed [rad/s].
     """
-    motors = boxed[0]
-    inertia = motors.inertia[j]
-    steps = int(period / STEP) + 1
+    inertia, period, command = motors.inertia[j], sample.period, sample.commands[j]
+    coulomb, viscous, speed = sample.coulomb, sample.viscous, sample.speeds[j]
+    steps = int(period / MODEL_STEP) + 1
     h = period / steps
-    model, torque = wheel[MODEL_SPEED], wheel[MODEL_TORQUE]
+    model, torque = wheel.model_speed, wheel.model_torque
     total = mean_speed = 0.0
     for _ in range(steps):
         asked = command
-        if by_speed:
-            asked, wheel[INTEGRAL] = speed_loop(j, command, model, wheel[INTEGRAL], h, motors)
+        if sample.by_speed:
+            asked, wheel.model_integral = speed_loop(
+                j, command, model, wheel.model_integral, h, motors)
         mean, torque = lagged_torque(
             j, torque, available_torque(j, asked, model, motors), h, motors)
         free = model + h * mean / inertia - turned * h / period
-        # Dry friction stops it at most.
-        left = abs(free) * (1.0 - h * friction[1] / inertia) - h * friction[0] / inertia
+        # Dry friction cannot do more than stop the wheel.
+        left = abs(free) * (1.0 - h * viscous / inertia) - h * coulomb / inertia
         after = copysign(max(left, 0.0), free)
         total += mean / steps
         mean_speed += 0.5 * (model + after) / steps
         model = after
-    behind = speed - mean_speed
-    if not by_speed:
-        model += behind * period / (SLOW if abs(speed) > SLOWEST else SOON)
-    wheel[MODEL_SPEED], wheel[MODEL_TORQUE] = model, torque
-    return total, behind
+    residual = speed - mean_speed
+    if not sample.by_speed:
+        model += residual * period / (LEARNING_TIME if abs(speed) > MIN_SPEED else SLOW_RESET)
+    wheel.model_speed, wheel.model_torque = model, torque
+    return total, residual
 
 
 @kernel
-def _broken(wheel: Array, speed: float, scale: float, friction: Array) -> int:
-    """Tell what is the matter with a wheel that does not follow."""
-    effort, expected = wheel[EFFORT], wheel[EXPECTED]
-    nothing = NOTHING * scale
+def _isolate(wheel: Record, speed: float, scale: float, sample: Record) -> int:
+    """Return the fault state of a wheel with a large residual."""
+    effort, expected, coulomb = wheel.effort, wheel.expected, sample.coulomb
+    nothing = NO_TORQUE * scale
     if (abs(effort) < DEAD_SHARE * abs(expected) + nothing
             and abs(effort - expected) > 2.0 * nothing):
         return DEAD
-    taken = copysign(friction[0], speed) + friction[1] * speed if abs(speed) > STANDING else 0.0
-    lost = effort - taken - wheel[GAIN]
-    dry = friction[0]
-    if abs(lost) > max(5.0 * dry, BRAKED * scale) or (
-            abs(speed) < STANDING and abs(effort) > 1.5 * dry + nothing
+    friction = (copysign(coulomb, speed) + sample.viscous * speed
+                if abs(speed) > STANDING else 0.0)
+    lost = effort - friction - wheel.inertial
+    if abs(lost) > max(5.0 * coulomb, BRAKED * scale) or (
+            abs(speed) < STANDING and abs(effort) > 1.5 * coulomb + nothing
             and abs(lost) > 0.5 * abs(effort)):
         return STUCK
-    unasked = abs(effort - expected) > UNASKED * scale + 0.5 * abs(expected)
-    if unasked and (effort * expected < 0.0 or abs(effort) > 1.3 * abs(expected)):
+    uncommanded = abs(effort - expected) > UNCOMMANDED * scale + 0.5 * abs(expected)
+    if uncommanded and (effort * expected < 0.0 or abs(effort) > 1.3 * abs(expected)):
         return RUNAWAY
     if (abs(effort - expected) <= MISSING * abs(expected) + nothing
-            and abs(lost) <= FRICTION_LOSS * scale + INERTIA_ERROR * abs(wheel[GAIN])):
-        # The model drifted, as far as its inertia may be wrong.
+            and abs(lost) <= FRICTION_LOSS * scale + INERTIA_ERROR * abs(wheel.inertial)):
+        # The model drifted by no more than a wrong inertia explains.
         return HEALTHY
     return DEGRADED
 
 
 @kernel
-def _degraded(j: int, wheel: Array, asked: float, by_speed: bool, speed: float, behind: float,
-              effort: float, gain: float, command: float, period: float, long: float,
-              gained: float, friction: Array, boxed: NDArray[np.record], past: Array,
-              late: Array) -> bool:
-    """Tell whether a wheel lacks torque or acts late, for long enough to say so."""
-    motors = boxed[0]
-    scale = _scale(j, friction, motors)
-    if by_speed:
-        seen = speed - 0.5 * gained * LOOP_STEP / period
-        asked = _replicate(j, wheel, command, seen, effort, period, boxed)
+def _is_degraded(j: int, wheel: Record, sample: Record, observation: _Observation,
+                 motors: Motors) -> bool:
+    """Return whether a wheel has lacked torque or acted late for long enough."""
+    scale, long, period = observation.scale, observation.long, sample.period
+    speed, effort, expected = sample.speeds[j], sample.efforts[j], observation.expected
+    if sample.by_speed:
+        seen = speed - 0.5 * observation.gained * LOOP_STEP / period
+        expected = _run_replica(j, wheel, sample, seen, motors)
     for delay in range(DELAYS - 1, 0, -1):
-        past[delay] = past[delay - 1]
-    past[0] = asked
-    wheel[LONG_EFFORT] += long * (effort - wheel[LONG_EFFORT])
-    wheel[LONG_EXPECTED] += long * (asked - wheel[LONG_EXPECTED])
-    wheel[LONG_GAIN] += long * (gain - wheel[LONG_GAIN])
-    wheel[LONG_BEHIND] += long * (behind - wheel[LONG_BEHIND])
-    best = inf
+        wheel.asked[delay] = wheel.asked[delay - 1]
+    wheel.asked[0] = expected
+    wheel.long_effort += long * (effort - wheel.long_effort)
+    wheel.long_expected += long * (expected - wheel.long_expected)
+    wheel.long_inertial += long * (observation.inertial - wheel.long_inertial)
+    wheel.long_residual += long * (observation.residual - wheel.long_residual)
+    best, delay_errors = inf, wheel.delay_errors
     for delay in range(DELAYS):
-        error = effort - past[delay]
-        late[delay] += long * (error * error - late[delay])
+        error = effort - wheel.asked[delay]
+        delay_errors[delay] += long * (error * error - delay_errors[delay])
         if delay >= FIRST_DELAY:
-            best = min(best, late[delay])
-    wheel[FAST_FOR] = wheel[FAST_FOR] + period if abs(speed) > SLOWEST else 0.0
-    if wheel[FAST_FOR] > 0.0:
-        lost = (effort - gain) * copysign(1.0, speed) - friction[0] - friction[1] * abs(speed)
-        # Nothing is known at first: then the plain mean.
-        share = long if wheel[KNOWN] else max(long, period / wheel[FAST_FOR])
-        wheel[LOST] += share * (lost - wheel[LOST])
-    missing = abs(wheel[LONG_EXPECTED] - wheel[LONG_EFFORT]) > (
-        (MISSING_BY_SPEED if by_speed else MISSING) * abs(wheel[LONG_EXPECTED])
-        + NOTHING * scale)
-    if by_speed:
-        tardy = abs(wheel[LONG_BEHIND]) > BEHIND
+            best = min(best, delay_errors[delay])
+    wheel.turning_time = wheel.turning_time + period if abs(speed) > MIN_SPEED else 0.0
+    if wheel.turning_time > 0.0:
+        loss = ((effort - observation.inertial) * copysign(1.0, speed) - sample.coulomb
+                - sample.viscous * abs(speed))
+        # The plain mean until there is a usual loss.
+        share = long if wheel.loss_known else max(long, period / wheel.turning_time)
+        wheel.loss += share * (loss - wheel.loss)
+    missing = abs(wheel.long_expected - wheel.long_effort) > (
+        (MISSING_BY_SPEED if sample.by_speed else MISSING) * abs(wheel.long_expected)
+        + NO_TORQUE * scale)
+    if sample.by_speed:
+        delayed = abs(wheel.long_residual) > DELAY_RESIDUAL
     else:
-        tardy = late[0] > max(EXPLAINED_BETTER * best, (VISIBLE * scale) ** 2)
-    rubbing = (friction[0] > 0.0 and wheel[FAST_FOR] > AFTER_SLOW
-               and _rubs(wheel, speed, scale, period))
-    # A share of little is no evidence.
-    missing &= max(abs(wheel[LONG_EFFORT]), abs(wheel[LONG_EXPECTED])) > LOOKED_AT * scale
-    if wheel[SUSPECT_FOR] < 0.0 or (
-            wheel[SETTLED] > AFTER_STRAIN and (missing or tardy or rubbing)):
-        wheel[SUSPECT_FOR] += period
+        delayed = delay_errors[0] > max(DELAY_RATIO * best, (DELAY_VISIBLE * scale) ** 2)
+    dragging = (sample.coulomb > 0.0 and wheel.turning_time > MIN_SPEED_TIME
+                and _is_dragging(wheel, speed, scale, period))
+    # A share of a small torque is no evidence.
+    missing &= max(abs(wheel.long_effort), abs(wheel.long_expected)) > MIN_EFFORT * scale
+    if wheel.degraded_time < 0.0 or (
+            wheel.unstrained_time > STRAINED_PAUSE and (missing or delayed or dragging)):
+        wheel.degraded_time += period
     else:
-        wheel[SUSPECT_FOR] = 0.0
-    return bool(wheel[SUSPECT_FOR] > PERSISTENT)
+        wheel.degraded_time = 0.0
+    return bool(wheel.degraded_time > DEGRADED_TIME)
 
 
 @kernel
-def _rubs(wheel: Array, speed: float, scale: float, period: float) -> bool:
-    """Tell whether friction takes more than it used to, and learn what it is used to."""
-    accelerated = wheel[LONG_GAIN] * copysign(1.0, speed)
-    if wheel[KNOWN] == 0.0:
-        wheel[LEARNT], wheel[LEARNT_GAIN], wheel[KNOWN] = wheel[LOST], accelerated, 1.0
-    allowed = FRICTION_LOSS * scale + INERTIA_ERROR * abs(accelerated - wheel[LEARNT_GAIN])
-    if wheel[LOST] - wheel[LEARNT] > allowed:
+def _is_dragging(wheel: Record, speed: float, scale: float, period: float) -> bool:
+    """Return whether friction takes more than usual, and learn the usual loss."""
+    inertial = wheel.long_inertial * copysign(1.0, speed)
+    if wheel.loss_known == 0.0:
+        wheel.usual_loss, wheel.usual_inertial, wheel.loss_known = wheel.loss, inertial, 1.0
+    allowed = FRICTION_LOSS * scale + INERTIA_ERROR * abs(inertial - wheel.usual_inertial)
+    if wheel.loss - wheel.usual_loss > allowed:
         return True
-    # What is about to be too much is not learnt as usual.
-    share = period / (SLOW if wheel[LOST] - wheel[LEARNT] < 0.5 * allowed else VERY_SLOW)
-    wheel[LEARNT] += share * (wheel[LOST] - wheel[LEARNT])
-    wheel[LEARNT_GAIN] += share * (accelerated - wheel[LEARNT_GAIN])
+    # A loss that is about to be reported must not be learnt as usual.
+    share = period / (
+        LEARNING_TIME if wheel.loss - wheel.usual_loss < 0.5 * allowed else SLOW_LEARNING_TIME)
+    wheel.usual_loss += share * (wheel.loss - wheel.usual_loss)
+    wheel.usual_inertial += share * (inertial - wheel.usual_inertial)
     return False
 
 
 @kernel
-def _replicate(j: int, wheel: Array, command: float, speed: float, effort: float, period: float,
-               boxed: NDArray[np.record]) -> float:
+def _run_replica(j: int, wheel: Record, sample: Record, speed: float, motors: Motors
+                 ) -> float:
     """
-    Return what the motor's electronics ask for, seeing this command and this speed [N m].
+    Return the torque that the motor's speed loop asks for at a speed [N m].
 
-    Led back slowly to what the motor gives, or the rounding of the speeds would add up.
+    The replica is led back slowly to the reported effort: it integrates the rounding of speeds.
     """
-    motors = boxed[0]
-    limit = motors.torque_limit[j]
-    if not abs(wheel[REPLICA]) <= limit or wheel[SETTLED] < AFTER_STRAIN:
-        wheel[REPLICA] = effort - SPEED_BANDWIDTH * motors.inertia[j] * (command - speed)
-    asked, wheel[REPLICA] = speed_loop(j, command, speed, wheel[REPLICA], period, motors)
-    wheel[REPLICA] += (effort - asked) * period / SLOW
-    mean, wheel[REPLICA_TORQUE] = lagged_torque(
-        j, wheel[REPLICA_TORQUE], asked, period, motors)
+    limit, period, effort = motors.torque_limit[j], sample.period, sample.efforts[j]
+    command = sample.commands[j]
+    if (not abs(wheel.replica_integral) <= limit
+            or wheel.unstrained_time < STRAINED_PAUSE):
+        wheel.replica_integral = effort - SPEED_BANDWIDTH * motors.inertia[j] * (command - speed)
+    asked, wheel.replica_integral = speed_loop(
+        j, command, speed, wheel.replica_integral, period, motors)
+    wheel.replica_integral += (effort - asked) * period / LEARNING_TIME
+    mean, wheel.replica_torque = lagged_torque(j, wheel.replica_torque, asked, period, motors)
     return mean

@@ -9,7 +9,7 @@ from array import array
 from collections.abc import Iterator, Sequence
 
 from fourbar_ros.common import names
-from fourbar_ros.control.actuation_cost import ENERGIES
+from fourbar_ros.control.actuation_cost_sums import ENERGIES
 from fourbar_ros.control.wheel_command import WheelCommand
 from fourbar_ros.loop.closed_loop import Step
 from fourbar_ros.mechanism import JOINT_NAMES, LINK_NAMES, SENSOR_NAMES

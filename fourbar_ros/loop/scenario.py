@@ -21,7 +21,7 @@ from fourbar_ros.common.config_files import config_file, load_yaml
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.settings import check_keys, Setting, SettingError, settings_of
 from fourbar_ros.control import ControllerSettings
-from fourbar_ros.control.parameters import SETTINGS as CONTROLLER
+from fourbar_ros.control.settings import SETTINGS as CONTROLLER
 from fourbar_ros.device import SupervisorSettings
 from fourbar_ros.estimation import EstimatorSettings
 from fourbar_ros.estimation.estimator_settings import SETTINGS as ESTIMATOR

@@ -12,14 +12,14 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from fourbar_ros.common import names
 from fourbar_ros.common.monotonic_clock import monotonic_ns
 from fourbar_ros.control import Controller, ControllerSettings, Point, SetpointError
-from fourbar_ros.control.actuation_cost import ENERGIES
-from fourbar_ros.control.parameters import PARAMETERS
+from fourbar_ros.control.actuation_cost_sums import ENERGIES
 from fourbar_ros.control.scalars import (
     ALLOCATION,
     allocation_scalars,
     MOMENTUM,
     momentum_scalars,
 )
+from fourbar_ros.control.settings import PARAMETERS
 from fourbar_ros.control.wheel_command import by_name
 from fourbar_ros.loop.stamp_pairing import LatenessDetector, StampPairs
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism
@@ -207,7 +207,8 @@ class StatusPublisher:
         # Each new goal increases the number of accepted setpoints, so the goal itself is left out.
         state = (controller.mode, controller.goal is None, controller.accepted,
                  controller.refused, self.judged_stamp, controller.settings, controller.problem,
-                 controller.branch, controller.wheels.verdicts.tobytes(), self._momentum_warning)
+                 controller.branch, controller.wheels.fault_states.tobytes(),
+                 self._momentum_warning)
         if state == self._published:
             return
         if controller.problem not in ('', self._logged_problem):

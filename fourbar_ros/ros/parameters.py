@@ -17,7 +17,7 @@ import sys
 from typing import Any
 
 from fourbar_ros.common.settings import Setting
-from fourbar_ros.control.parameters import PARAMETERS as CONTROLLER_PARAMETERS
+from fourbar_ros.control.settings import PARAMETERS as CONTROLLER_PARAMETERS
 from fourbar_ros.estimation.estimator_settings import PARAMETERS as ESTIMATOR_PARAMETERS
 from fourbar_ros.loop import load_scenario
 from fourbar_ros.ros import hardware, plant, prototype_emulator

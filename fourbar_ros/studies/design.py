@@ -32,6 +32,7 @@ from fourbar_ros.studies.design_model import (
     Design,
     DURATION,
     evaluate,
+    least_energy,
     MANOEUVRES,
     RADIUS,
     RIM,
@@ -162,8 +163,8 @@ def _shortest(mechanism: Mechanism, table: Table, turn: tuple[float, float]) -> 
     bearing = np.full(4, table.wheel_bearings.coulomb)
     try:
         return shortest_duration(
-            mechanism, segment.start, segment.goal, assemble(mechanism, 0.0, THETA),
-            Wheels(np.zeros(4), mechanism.flywheel_inertias, bearing))
+            mechanism, segment, assemble(mechanism, 0.0, THETA),
+            Wheels(np.zeros(4), least_energy(mechanism), bearing))
     except SetpointError:
         return None
 

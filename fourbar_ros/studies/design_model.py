@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from math import pi
 from typing import Any
 
+from fourbar_ros.control.allocation import Allocation, make_allocation
 from fourbar_ros.mechanism import assemble, Mechanism
 from fourbar_ros.plant import Table
 from fourbar_ros.studies.planned_cost import (
@@ -116,11 +117,16 @@ class Design:
             'manoeuvres': {name: cost.totals() for name, cost in self.costs.items()}}
 
 
+def least_energy(mechanism: Mechanism) -> Allocation:
+    """Return the allocation `min_energy` of four wheels."""
+    return make_allocation('min_energy', mechanism.flywheel_inertias, [True] * 4)
+
+
 def evaluate(mechanism: Mechanism, table: Table) -> Design:
     """Evaluate the manoeuvres with four wheels that share the torque for the least energy."""
     return Design(mechanism, {name: actuation_cost(
         mechanism, rest_to_rest(THETA, turn, DURATION), assemble(mechanism, 0.0, THETA),
-        mechanism.flywheel_inertias, table=table, samples=SAMPLES)
+        least_energy(mechanism), table=table, samples=SAMPLES)
         for name, turn in MANOEUVRES.items()})
 
 

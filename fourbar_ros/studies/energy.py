@@ -18,7 +18,7 @@ from typing import Any
 
 from fourbar_ros.common.checks import at_least, at_most, Check, within
 from fourbar_ros.common.progress import Progress
-from fourbar_ros.control.allocation import mobilities
+from fourbar_ros.control.allocation import make_allocation
 from fourbar_ros.mechanism import assemble, load_mechanism, Mechanism
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.state import make_state
@@ -113,7 +113,7 @@ def turn(mechanism: Mechanism, goal: tuple[float, float], law: str, speeds: Arra
     """
     return actuation_cost(
         mechanism, rest_to_rest(THETA, goal, DURATION), assemble(mechanism, 0.0, THETA),
-        mobilities(law, mechanism.flywheel_inertias, [True] * 4), speeds)
+        make_allocation(law, mechanism.flywheel_inertias, [True] * 4), speeds)
 
 
 def closed_form(wheels: float) -> dict[str, float]:

@@ -15,9 +15,8 @@ from functools import cached_property
 from typing import Any
 
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.control.branch import branch_at, LINKS_ALONE
-from fourbar_ros.control.feasibility import wheel_loads
-from fourbar_ros.control.setpoint import angles_along
+from fourbar_ros.control.allocation import Allocation
+from fourbar_ros.control.feasibility import loads_along, path_of
 from fourbar_ros.control.soft_step import SoftStep, TrajectorySegment
 from fourbar_ros.kernels.runge_kutta import Drive
 from fourbar_ros.mechanism import Mechanism
@@ -166,49 +165,44 @@ def rest_to_rest(theta: float, turn: Array | tuple[float, float], duration: floa
 
 
 def actuation_cost(
-    mechanism: Mechanism, segment: TrajectorySegment, present: Array, weights_inv: Array,
+    mechanism: Mechanism, segment: TrajectorySegment, present: Array, allocation: Allocation,
     speeds: Array | None = None, table: Table | None = None, samples: int = SAMPLES,
 ) -> ActuationCost:
     """
     Compute wheel torques and speeds along a trajectory by inverse dynamics.
 
     :param present: (4,) link angles at the start, which select the branch [rad].
-    :param weights_inv: (4,) inverse weights w of the allocation, which minimises the sum of
-        `tau_i^2 / w_i`.
+    :param allocation: rule that shares the demand among the wheels.
     :param speeds: (4,) absolute speeds of the wheels at the start, default 0 [rad/s].
     :param table: its friction and drag act on the linkage, default none.
     :param samples: number of instants.
     :raises ClosureError: the loop cannot close along the trajectory.
     :raises ActuationCostError: the permitted wheels cannot provide the torque.
     """
-    times = segment.instants(samples)
-    states = segment.sample(times)
-    branch = branch_at(mechanism, present)
-    angles = angles_along(mechanism, states[:, 0], present, branch)
-    twins = LINKS_ALONE if branch is None else branch.twins
-    constants = np.array([mechanism.constants])
-    metric = np.asarray(weights_inv, dtype=float)
-    torques, gained, unmet = wheel_loads(
-        times, angles, states[:, 1:], branch is not None, twins, metric, constants)
+    path = path_of(mechanism, segment, present, samples=samples)
+    times, angles, links = path.times, path.angles, path.paired_links
+    torques, gained, unmet = loads_along(
+        mechanism, path, allocation, np.zeros(4) if speeds is None else speeds)
     if not unmet <= UNMET:
         raise ActuationCostError(
             f'the permitted wheels leave {100.0 * unmet:.3g} % of the demanded torque unmet '
             f'(limit {100.0 * UNMET:g} %)', value=unmet, limit=UNMET)
     wheel_maps = np.zeros((len(times), 2, 4))
-    if branch is not None:
+    if path.paired:
         for axis in range(2):
-            wheel_maps[:, axis, [twins[axis], twins[axis + 2]]] = 1.0
+            wheel_maps[:, axis, [links[axis], links[axis + 2]]] = 1.0
     else:
         wheel_maps[:, 0, 0] = wheel_maps[:, 1, 1] = 1.0
         wheel_maps[:, :, 2:] = [gamma_matrix(four, mechanism.link_lengths).T for four in angles]
-    link_rates = np.einsum('nki,nk->ni', wheel_maps, states[:, 1])
+    link_rates = np.einsum('nki,nk->ni', wheel_maps, path.motion[:, 0])
     # The gained speeds are relative to the links.
     absolute = gained + link_rates - link_rates[0] + (np.zeros(4) if speeds is None else speeds)
     bearings = np.zeros_like(torques)
     if table is not None:
-        shared = metric * wheel_maps
+        shared = allocation.weights_inv * wheel_maps
         on_axes = np.einsum('nki,ni->nk', wheel_maps, forces_along(
-            angles, link_rates, constants, np.array([surroundings_of(table)])))
+            angles, link_rates, np.array([mechanism.constants]),
+            np.array([surroundings_of(table)])))
         against = np.einsum('nki,nk->ni', shared, np.linalg.solve(
             np.einsum('nki,nmi->nkm', shared, wheel_maps), on_axes[..., None])[..., 0])
         torques += against

@@ -6,21 +6,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from math import pi
 
 from fourbar_ros.control.allocation import (
-    allocate,
+    Allocation,
     AllocationError,
     ALLOCATIONS,
+    ConstrainedNorm,
+    make_allocation,
+    MinMaxSpeed,
+    WeightedNorm,
+)
+from fourbar_ros.control.allocation_solver import (
     controllable,
     largest_scale,
     LOST,
     MARGIN,
-    mobilities,
+    MotorState,
     principal_axes,
     WEAK,
+)
+from fourbar_ros.control.allocation_solver import (
+    Problem as ReducedProblem,
 )
 from fourbar_ros.control.soft_step import SoftStep
 from fourbar_ros.mechanism import assemble, Mechanism, reduced_form
@@ -44,37 +54,43 @@ OPPOSITE = np.array([0.5, 0.5, -0.5, -0.5])
 
 each_seed = pytest.mark.parametrize('seed', SEEDS)
 each_allocation = pytest.mark.parametrize('name', ALLOCATIONS)
+each_norm = pytest.mark.parametrize('name', ALLOCATIONS[:4])
+Refuses = Callable[..., AbstractContextManager[None]]
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
     """
-    What may be asked of the wheels.
+    An allocation problem.
 
-    :param rows: (n, 4).
+    :param wheel_map: (n, 4).
     :param demand: (n,) [N m].
     :param inertias: (4,) of the wheels [kg m^2].
     :param available: (4,) bool.
     :param lower, upper: (4,) bounds of the torques [N m].
+    :param speeds: (4,) of the wheels [rad/s].
     """
 
-    rows: Array
+    wheel_map: Array
     demand: Array
     inertias: Array
     available: NDArray[np.bool_]
     lower: Array
     upper: Array
+    speeds: Array = field(default_factory=lambda: np.zeros(4))
 
     def share(self, name: str) -> tuple[Array, float]:
         """Return torques (4,) and the scale."""
-        torques = np.full(4, np.nan)
-        scale = allocate(self.rows, self.demand, self.metric(name), self.lower, self.upper,
-                         name == 'bounded', torques)
-        return torques, scale
+        return self.rule(name).solve(
+            self.wheel_map, self.demand, MotorState(self.lower, self.upper, self.speeds))
+
+    def rule(self, name: str) -> Allocation:
+        """Return the allocation of a name."""
+        return make_allocation(name, self.inertias, self.available)
 
     def metric(self, name: str) -> Array:
-        """Return the mobilities (4,)."""
-        return mobilities(name, self.inertias, self.available)
+        """Return the inverse weights (4,)."""
+        return self.rule(name).weights_inv
 
 
 Draw = Callable[[int], Problem]
@@ -123,14 +139,14 @@ def test_demand_is_met_as_far_as_the_wheels_can(name: str, seed: int, draw: Draw
     """Two wheels of two pairs cannot drive three axes; two axes they can almost everywhere."""
     problem = unlimited(draw(seed))
     torques, scale = problem.share(name)
-    directions, shares = controllable(problem.rows, problem.metric(name))
+    directions, shares = controllable(problem.wheel_map, problem.metric(name))
     assert scale == 1.0
-    missed = directions @ (problem.rows @ torques + problem.demand)
+    missed = directions @ (problem.wheel_map @ torques + problem.demand)
     np.testing.assert_allclose(missed[shares == 1.0], 0.0, rtol=0.0, atol=MET)
     assert name == 'two_wheels' or (shares == 1.0).all()
 
 
-@each_allocation
+@each_norm
 @each_seed
 def test_any_other_answer_costs_more(name: str, seed: int, draw: Draw) -> None:
     problem = unlimited(draw(seed))
@@ -139,7 +155,7 @@ def test_any_other_answer_costs_more(name: str, seed: int, draw: Draw) -> None:
     torques, _ = problem.share(name)
     assert not torques[~used].any()
     least = (torques[used] ** 2 / metric[used]).sum()
-    free = null_space(problem.rows[:, used])
+    free = null_space(problem.wheel_map[:, used])
     rng = np.random.default_rng(seed)
     for _ in range(50 if free.size else 0):
         other = torques[used] + free @ rng.uniform(-SIZE, SIZE, free.shape[1])
@@ -149,9 +165,11 @@ def test_any_other_answer_costs_more(name: str, seed: int, draw: Draw) -> None:
 def test_least_norm_is_that_of_accelerations_and_least_energy_that_of_speeds() -> None:
     inertias = np.array([1.0, 2.0, 3.0, 4.0])
     everything = np.ones(4, dtype=bool)
-    np.testing.assert_array_equal(mobilities('min_norm', inertias, everything), inertias ** 2)
-    for name in ('min_energy', 'bounded'):
-        np.testing.assert_array_equal(mobilities(name, inertias, everything), inertias)
+    np.testing.assert_array_equal(
+        make_allocation('min_norm', inertias, everything).weights_inv, inertias ** 2)
+    for name in ('min_energy', 'bounded', 'min_max_speed'):
+        np.testing.assert_array_equal(
+            make_allocation(name, inertias, everything).weights_inv, inertias)
 
 
 @pytest.mark.parametrize(('available', 'used'), [
@@ -160,7 +178,8 @@ def test_least_norm_is_that_of_accelerations_and_least_energy_that_of_speeds() -
     ((0, 0, 0, 0), (0, 0, 0, 0))])
 def test_two_wheels_are_one_of_each_pair(available: tuple[int, ...], used: tuple[int, ...]
                                          ) -> None:
-    metric = mobilities('two_wheels', np.ones(4), np.array(available, dtype=bool))
+    metric = make_allocation(
+        'two_wheels', np.ones(4), np.array(available, dtype=bool)).weights_inv
     np.testing.assert_array_equal(metric > 0.0, np.array(used, dtype=bool))
 
 
@@ -168,12 +187,12 @@ def test_wheel_that_failed_is_left_alone_by_all() -> None:
     for name in ALLOCATIONS:
         for wheel in range(4):
             available = np.arange(4) != wheel
-            assert mobilities(name, np.ones(4), available)[wheel] == 0.0
+            assert make_allocation(name, np.ones(4), available).weights_inv[wheel] == 0.0
 
 
-def test_unknown_allocation_is_refused() -> None:
-    with pytest.raises(AllocationError, match="'even' is unknown .*two_wheels, min_norm"):
-        mobilities('even', np.ones(4), [True] * 4)
+def test_unknown_allocation_is_refused(refuses: Refuses) -> None:
+    with refuses(AllocationError, name='allocation', value='even', limit=ALLOCATIONS):
+        make_allocation('even', np.ones(4), [True] * 4)
 
 
 def test_twins_of_the_rhombus_share_equally(paper: Mechanism) -> None:
@@ -232,7 +251,8 @@ def quarter_turn(mechanism: Mechanism, name: str) -> tuple[float, float, Array]:
 
 @pytest.mark.parametrize(('name', 'speed', 'energy'), [
     ('min_norm', 62.37, 2.6452e-3), ('min_energy', 62.37, 2.6452e-3),
-    ('bounded', 62.37, 2.6452e-3), ('two_wheels', 124.74, 5.2904e-3)])
+    ('bounded', 62.37, 2.6452e-3), ('min_max_speed', 62.37, 2.6452e-3),
+    ('two_wheels', 124.74, 5.2904e-3)])
 def test_quarter_turn_of_the_paper(name: str, speed: float, energy: float, paper: Mechanism
                                    ) -> None:
     """The numbers follow by hand from A = 1.44e-4 kg m^2 and the peak rate of the soft step."""
@@ -274,7 +294,7 @@ def test_rounding_at_a_bound_of_zero_stops_nobody() -> None:
     upper = np.array([1.0, 0.0, 1.0, 0.0])
     problem = Problem(rows, np.array([-1.0, 0.0]), np.ones(4), np.ones(4, dtype=bool),
                       -np.array([1.0, 0.0, 1.0, 0.0]), upper)
-    for name in ('min_norm', 'bounded'):
+    for name in ('min_norm', 'bounded', 'min_max_speed'):
         torques, scale = problem.share(name)
         assert scale == 1.0
         np.testing.assert_allclose(torques, [0.5, 0.0, 0.5, 0.0], rtol=1e-15)
@@ -287,7 +307,7 @@ def admitted(problem: Problem) -> float:
     used = problem.available
     solution = linprog(
         np.append(np.zeros(used.sum()), -1.0),
-        A_eq=np.column_stack([problem.rows[:, used], problem.demand / SIZE]),
+        A_eq=np.column_stack([problem.wheel_map[:, used], problem.demand / SIZE]),
         b_eq=np.zeros(len(problem.demand)),
         bounds=[*zip(problem.lower[used] / SIZE, problem.upper[used] / SIZE), (0.0, 10.0)])
     assert solution.success
@@ -298,7 +318,7 @@ def pushes_of(problem: Problem) -> tuple[Array, Array, Array]:
     """Return rows (n, 4) and bounds (4,) in the metric of `bounded`."""
     root = np.sqrt(problem.metric('bounded') / problem.metric('bounded').max())
     room = np.divide([problem.lower, problem.upper], root, out=np.zeros((2, 4)), where=root > 0.0)
-    return problem.rows * root, room[0], room[1]
+    return problem.wheel_map * root, room[0], room[1]
 
 
 def circles(problem: Problem) -> tuple[float, float]:
@@ -323,10 +343,12 @@ def circles(problem: Problem) -> tuple[float, float]:
 def test_without_margin_the_scale_is_what_the_bounds_admit(seed: int, draw: Draw) -> None:
     problem = draw(seed)
     _, low, high = pushes_of(problem)
-    directions, spread, _, _ = principal_axes(problem.rows, problem.metric('bounded'))
+    directions, effectiveness, gains, _ = principal_axes(
+        problem.wheel_map, problem.metric('bounded'))
     goal = np.zeros(3)
     goal[:len(directions)] = -directions @ problem.demand
-    scale = largest_scale(spread, goal, len(directions), low, high, 0.0)
+    scale = largest_scale(ReducedProblem(
+        effectiveness, gains, goal, len(directions), low, high, np.ones(4)), 0.0)
     # The tolerance of the linear program.
     assert min(scale, 10.0) == pytest.approx(admitted(problem), abs=1e-7)
 
@@ -336,7 +358,8 @@ def test_demand_is_met_in_proportion_within_bounds(seed: int, draw: Draw) -> Non
     """And the margin costs no more than its share of the most."""
     problem = draw(seed)
     torques, scale = problem.share('bounded')
-    np.testing.assert_allclose(-problem.rows @ torques, scale * problem.demand, rtol=0.0, atol=MET)
+    np.testing.assert_allclose(
+        -problem.wheel_map @ torques, scale * problem.demand, rtol=0.0, atol=MET)
     assert (torques <= problem.upper).all() and (torques >= problem.lower).all()
     assert not torques[~problem.available].any()
     largest = min(admitted(problem), 1.0)
@@ -362,7 +385,7 @@ def test_torques_within_bounds_have_their_certificate(seed: int, draw: Draw) -> 
     at_lower = x < problem.lower[used] / SIZE + 1e-9
     metric = problem.metric('bounded')[used]
     gradient = x * metric.mean() / metric
-    walls, rows = np.eye(used.sum()), problem.rows[:, used].T
+    walls, rows = np.eye(used.sum()), problem.wheel_map[:, used].T
     _, residual = nnls(np.column_stack(
         [rows, -rows, -walls[:, at_upper], walls[:, at_lower]]), gradient)
     # What is within 1e-9 of a bound counts as there; the rows make ten times as much of it.
@@ -375,7 +398,7 @@ def test_torques_within_bounds_are_those_of_a_general_solver(seed: int, draw: Dr
     torques, scale = problem.share('bounded')
     used = problem.available
     metric = problem.metric('bounded')[used] / problem.inertias.max()
-    rows, goal = problem.rows[:, used], -scale * problem.demand / SIZE
+    rows, goal = problem.wheel_map[:, used], -scale * problem.demand / SIZE
     solution = minimize(
         lambda x: (x ** 2 / metric).sum(), np.zeros(used.sum()), jac=lambda x: 2.0 * x / metric,
         method='SLSQP', bounds=[*zip(problem.lower[used] / SIZE, problem.upper[used] / SIZE)],
@@ -417,7 +440,7 @@ def lipschitz(problem: Problem) -> float:
 def test_torques_follow_the_demand_without_jumps(seed: int, draw: Draw) -> None:
     problem = draw(seed)
     limits = np.maximum(problem.upper, 0.2 * SIZE)
-    problem = replace(problem, rows=problem.rows[:2], available=np.ones(4, dtype=bool),
+    problem = replace(problem, wheel_map=problem.wheel_map[:2], available=np.ones(4, dtype=bool),
                       lower=-limits, upper=limits)
     bound = lipschitz(problem)
     before, last, degraded = None, None, 0
@@ -472,7 +495,7 @@ def test_axis_without_wheels_is_dropped_and_the_other_met(paper: Mechanism) -> N
         torques, scale = problem.share(name)
         assert scale == 1.0
         np.testing.assert_allclose(torques, expected, rtol=1e-12, atol=1e-18)
-    directions, shares = controllable(problem.rows, problem.metric('min_norm'))
+    directions, shares = controllable(problem.wheel_map, problem.metric('min_norm'))
     np.testing.assert_array_equal(np.sort(shares), [0.0, 1.0])
     np.testing.assert_allclose(np.abs(directions[shares == 1.0]), [[0.0, 1.0]], atol=1e-12)
 
@@ -482,15 +505,16 @@ def test_directions_are_orthonormal_and_wheels_act_on_each_alone(seed: int, draw
     """They are the left singular vectors of rows v^(1/2)."""
     problem = draw(seed)
     metric = problem.metric('min_energy')
-    directions, shares = controllable(problem.rows, metric)
-    pushes = directions @ problem.rows * np.sqrt(metric / metric.max())
+    directions, shares = controllable(problem.wheel_map, metric)
+    pushes = directions @ problem.wheel_map * np.sqrt(metric / metric.max())
     # Entries are up to 8 and so are the gains.
     np.testing.assert_allclose(directions @ directions.T, np.eye(len(shares)), atol=1e-14)
     product = pushes @ pushes.T
     np.testing.assert_allclose(product - np.diag(np.diag(product)), 0.0, atol=1e-12)
     np.testing.assert_allclose(
         np.sort(np.sqrt(np.diag(product))),
-        np.sort(np.linalg.svd(problem.rows * np.sqrt(metric / metric.max()), compute_uv=False)),
+        np.sort(np.linalg.svd(
+            problem.wheel_map * np.sqrt(metric / metric.max()), compute_uv=False)),
         rtol=1e-12)
 
 
@@ -509,8 +533,8 @@ def test_demand_fades_before_torques_grow() -> None:
     step = 1e-4
     for gamma in np.arange(-0.4, 0.4, step):
         rows = np.array([[1.0, 0.0, gamma, 0.3], [0.0, 1.0, 0.4, 1.0]])
-        torques = np.empty(4)
-        allocate(rows, demand, metric, -NO_LIMIT, NO_LIMIT, False, torques)
+        torques, _ = WeightedNorm(metric).solve(
+            rows, demand, MotorState(-NO_LIMIT, NO_LIMIT, np.zeros(4)))
         assert np.linalg.norm(torques) <= 1.0 / WEAK * (1.0 + 1e-12)
         if before is not None:
             assert np.linalg.norm(torques - before) <= steepest * step * (1.0 + 1e-9)
@@ -522,8 +546,8 @@ def test_demand_fades_before_torques_grow() -> None:
     assert seen == {0.0, 1.0, 2.0}      # lost, weak and good
 
 
-@pytest.mark.parametrize('bounded', [False, True])
-def test_whatever_comes_torques_are_numbers_within_bounds(bounded: bool) -> None:
+@pytest.mark.parametrize('kind', ['proportional', 'bounded', 'min_max_speed'])
+def test_torques_are_finite_and_within_bounds_for_any_problem(kind: str) -> None:
     """Dependent rows, no demand, no room, no wheels, sizes apart by many orders; seed 5."""
     rng = np.random.default_rng(5)
     for trial in range(20_000):
@@ -536,17 +560,26 @@ def test_whatever_comes_torques_are_numbers_within_bounds(bounded: bool) -> None
         lower, upper = -rng.choice([0.0, 1.0, 1e-6, 2.0], 4), rng.choice([0.0, 1.0, 0.5], 4)
         if rng.random() < 0.2:
             upper[rng.integers(4)] = np.inf
-        torques = np.full(4, np.nan)
-        scale = allocate(rows, demand, metric, lower, upper, bounded, torques)
+        if kind == 'min_max_speed':
+            rule: Allocation = MinMaxSpeed(metric, np.ones(4))
+        else:
+            rule = (ConstrainedNorm if kind == 'bounded' else WeightedNorm)(metric)
+        speeds = np.zeros(4)
+        if kind == 'min_max_speed':
+            speeds = rng.choice([0.0, 1.0, -300.0, 20.0], 4)
+        torques, scale = rule.solve(rows, demand, MotorState(lower, upper, speeds))
         assert 0.0 <= scale <= 1.0, f'trial {trial}'
         assert np.isfinite(torques).all(), f'trial {trial}'
         assert (torques <= upper).all() and (torques >= lower).all(), f'trial {trial}'
         assert not torques[metric == 0.0].any(), f'trial {trial}'
-        if bounded and not (np.isfinite(lower).all() and np.isfinite(upper).all()):
+        if kind != 'proportional' and not (np.isfinite(lower).all() and np.isfinite(upper).all()):
             continue
         directions, shares = controllable(rows, metric)
         missed = directions @ (rows @ torques) + scale * shares * (directions @ demand)
         # Bounds may be exceeded by 1e-10 of torques up to scale demand / WEAK, which are clipped,
         # and a row makes 60 times as much of it.
         limit = 1e-10 / WEAK * 60.0 * scale * np.linalg.norm(demand)
+        if kind == 'min_max_speed':
+            # The null space adds torques up to the bounds of 2 N m, that are rounded as well.
+            limit += 1e-10 * 2.0 * 60.0
         assert (np.abs(missed[shares > 0.0]) <= limit + 1e-12).all(), f'trial {trial}'

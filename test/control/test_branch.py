@@ -8,12 +8,12 @@ from __future__ import annotations
 from math import pi
 
 from fourbar_ros.control.branch import (
+    adjoining_branch,
     Branch,
     branch_at,
     BRANCHES,
     CROSSED,
     FOLDED,
-    met_at,
     on_parallelogram,
     PARALLELOGRAM,
 )
@@ -39,7 +39,7 @@ MEETINGS = (
 
 
 def pose(branch: Branch, heading: float, theta: float) -> Array:
-    return branch.spread(np.array([heading, heading + theta]), np.full(2, branch.apart))
+    return branch.to_links(np.array([heading, heading + theta]), np.full(2, branch.pair_angle))
 
 
 @each_branch
@@ -48,7 +48,7 @@ def test_loop_closes_all_along_it(seed: int, branch: Branch, paper: Mechanism) -
     """Angles and rates: no gap opens, whatever the pairs do."""
     rng = np.random.default_rng(seed)
     angles = pose(branch, *rng.uniform(-3.0, 3.0, 2))
-    rates = branch.spread(rng.uniform(-1.0, 1.0, 2), np.zeros(2))
+    rates = branch.to_links(rng.uniform(-1.0, 1.0, 2), np.zeros(2))
     assert closure_error(paper, angles) < 1e-15, f'seed {seed}'
     arms = np.array([-1.0, 1.0, 1.0, -1.0]) * paper.link_lengths
     assert abs((arms * rates) @ np.exp(1j * angles)) < 1e-15, f'seed {seed}'
@@ -66,7 +66,7 @@ def test_turns_and_noise_do_not_hide_it(seed: int, branch: Branch, paper: Mechan
     rng = np.random.default_rng(seed)
     exact = pose(branch, 0.4, rng.uniform(0.1, pi - 0.1)) + 2.0 * pi * rng.integers(-2, 3, 4)
     measured = exact + rng.uniform(-4e-3, 4e-3, 4)
-    assert branch_at(paper, measured, choosing=True) == branch, f'seed {seed}'
+    assert branch_at(paper, measured, any_branch=True) == branch, f'seed {seed}'
     near = branch.nearest(measured)
     # On the branch, on the same turns, and no farther than the mean of two errors.
     assert closure_error(paper, near) < 1e-15
@@ -82,16 +82,16 @@ def test_two_meet_where_all_links_are_in_line(
 ) -> None:
     angles = pose(one, 0.3, theta)
     assert np.abs(wrap_angles(angles - pose(other, 0.3, theta_there))).max() < 1e-14
-    assert met_at(paper, one, angles) == other
-    assert met_at(paper, other, angles) == one
-    assert met_at(paper, one, pose(one, 0.3, theta + 2e-3)) is None
-    assert met_at(parallelogram, PARALLELOGRAM, angles) is None
+    assert adjoining_branch(paper, one, angles) == other
+    assert adjoining_branch(paper, other, angles) == one
+    assert adjoining_branch(paper, one, pose(one, 0.3, theta + 2e-3)) is None
+    assert adjoining_branch(parallelogram, PARALLELOGRAM, angles) is None
 
 
 def test_only_a_rhombus_has_all(paper: Mechanism, parallelogram: Mechanism) -> None:
     for branch in BRANCHES[1:]:
         angles = pose(branch, 0.3, 0.9)
         assert branch_at(paper, angles) is None
-        assert branch_at(paper, angles, choosing=True) == branch
-        assert branch_at(parallelogram, angles, choosing=True) is None
+        assert branch_at(paper, angles, any_branch=True) == branch
+        assert branch_at(parallelogram, angles, any_branch=True) is None
     assert on_parallelogram(parallelogram, pose(PARALLELOGRAM, 0.3, 0.9))

@@ -4,10 +4,12 @@
 """What the controller does before, while and after it may drive."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from math import pi
 from typing import Any
 
+from fourbar_ros.common.settings import SettingError
 from fourbar_ros.control import (
     Control,
     Controller,
@@ -16,12 +18,12 @@ from fourbar_ros.control import (
     Point,
     SetpointError,
 )
-from fourbar_ros.control.actuation_cost import COPPER, EQ9, FLYWHEEL_ENERGY, WORK
-from fourbar_ros.control.allocation import AllocationError
-from fourbar_ros.control.controller import LOST_IN_A_ROW
+from fourbar_ros.control.actuation_cost_sums import COPPER, EQ9, FLYWHEEL_ENERGY, WORK
+from fourbar_ros.control.allocation import ALLOCATIONS
+from fourbar_ros.control.controller import SLOWER_TICKS
 from fourbar_ros.control.reference_generator import STOPPING_TIME
-from fourbar_ros.control.tracking_law import SHARED_OUT
-from fourbar_ros.mechanism import assemble, kinetic_energy, Mechanism
+from fourbar_ros.control.tracking_law import MOTOR_SHARE
+from fourbar_ros.mechanism import assemble, FLYWHEEL_NAMES, kinetic_energy, Mechanism
 from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.mechanism.change_points import TORQUE_CUTOFF
 from fourbar_ros.plant import InitialState
@@ -31,6 +33,7 @@ import pytest
 
 Array = NDArray[np.float64]
 Drive = Callable[..., Any]
+Refuses = Callable[..., AbstractContextManager[None]]
 
 PERIOD = 4e-3
 PERIOD_NS = 4_000_000
@@ -80,29 +83,29 @@ def test_armed_it_holds_where_the_links_were(paper: Mechanism) -> None:
     assert control.torques[0] > 0.0
 
 
-def test_setpoint_is_refused_while_disarmed(drive: Drive) -> None:
+def test_setpoint_is_refused_while_disarmed(drive: Drive, refuses: Refuses) -> None:
     driven = drive(armed=False)
     for ticks in range(3):
-        with pytest.raises(SetpointError, match='not armed'):
+        with refuses(SetpointError, name='armed'):
             quarter_turn(driven)
         assert driven.controller.refused == ticks + 1
         driven.tick()
     driven.controller.device_armed(True)
-    with pytest.raises(SetpointError, match='not armed'):
+    with refuses(SetpointError, name='armed'):
         quarter_turn(driven)
     driven.tick()
     quarter_turn(driven)
     assert driven.controller.accepted == 1
 
 
-def test_disarming_drops_the_goal(drive: Drive) -> None:
+def test_disarming_drops_the_goal(drive: Drive, refuses: Refuses) -> None:
     driven = drive()
     quarter_turn(driven)
     for _ in range(500):
         driven.tick()
     assert driven.controller.mode == 'track'
     driven.controller.device_armed(False)
-    with pytest.raises(SetpointError, match='not armed'):
+    with refuses(SetpointError, name='armed'):
         quarter_turn(driven)
     angles = driven.angles.copy()
     control = driven.tick()
@@ -186,14 +189,14 @@ def test_refused_setpoint_does_not_disturb_the_move(drive: Drive) -> None:
 @pytest.mark.parametrize(('offset_s', 'accepted'), [
     (0.0, True), (-0.9, True), (0.9, True), (-1.1, False), (1.1, False), (-1e9, False)])
 def test_setpoint_with_a_foreign_stamp_is_refused(
-    offset_s: float, accepted: bool, drive: Drive,
+    offset_s: float, accepted: bool, drive: Drive, refuses: Refuses,
 ) -> None:
     driven = drive()
     stamp = driven.stamp_ns + round(offset_s * 1e9)
     if accepted:
         driven.controller.setpoint(['link_a'], [0.1], stamp)
     else:
-        with pytest.raises(SetpointError, match=f'{-offset_s:.3f} s before the last tick'):
+        with refuses(SetpointError, name='stamp', value=pytest.approx(-offset_s), limit=1.0):
             driven.controller.setpoint(['link_a'], [0.1], stamp)
 
 
@@ -220,7 +223,7 @@ def test_saturation_scales_all_wheels_together(uneven: Mechanism) -> None:
     limits = np.array([2e-5, 3e-6, 1e-5, 5e-5])
     free, wanted = pushed(replace(uneven, motor_torque_limits=np.full(4, np.inf)), angles, rates)
     limited, torques = pushed(replace(uneven, motor_torque_limits=limits), angles, rates)
-    limits *= SHARED_OUT['effort']
+    limits *= MOTOR_SHARE['effort']
     excess = (np.abs(wanted) / limits).max()
     assert excess > 1.5
     np.testing.assert_allclose(torques, wanted / excess, rtol=1e-14)
@@ -350,7 +353,7 @@ def test_idle_leaves_the_wheels_alone(moving: Any) -> None:
 
 @pytest.mark.parametrize('act', ['setpoint', 'trajectory', 'hold', 'damp'])
 @pytest.mark.parametrize(('state', 'reason'), [
-    ('disarmed', 'the device is not armed'), ('idle', 'the controller is not enabled')])
+    ('disarmed', 'armed'), ('idle', 'enabled')])
 def test_nothing_is_done_while_it_may_not_drive(
     act: str, state: str, reason: str, steer: Drive, prototype: Mechanism,
 ) -> None:
@@ -363,11 +366,12 @@ def test_nothing_is_done_while_it_may_not_drive(
         'setpoint': lambda: controller.setpoint(['link_a'], [0.1]),
         'trajectory': lambda: controller.trajectory(['link_a'], [Point([0.1], 5.0)]),
         'hold': controller.hold, 'damp': controller.damp}
-    with pytest.raises(SetpointError, match=f'^{reason}$'):
+    with pytest.raises(SetpointError) as caught:
         doing[act]()
+    assert caught.value.values['name'] == reason
     counted = act in ('setpoint', 'trajectory')
     assert (controller.accepted, controller.refused) == (0, int(counted))
-    assert controller.last_refusal == (reason if counted else '')
+    assert controller.last_refusal == (str(caught.value) if counted else '')
     steered.tick()
     assert (controller.mode, controller.goal) == (state, None)
 
@@ -432,7 +436,7 @@ STEPS: dict[str, Callable[[Any], None]] = {
 @pytest.mark.parametrize('second', [*STEPS])
 @pytest.mark.parametrize('first', [*STEPS])
 def test_any_mode_follows_any_other_without_a_blow(
-    first: str, second: str, command: str, steer: Drive, prototype: Mechanism,
+    first: str, second: str, command: str, steer: Drive, prototype: Mechanism, refuses: Refuses,
 ) -> None:
     """
     The torque never jumps by more than what it takes to brake the links that move, and it ends.
@@ -451,7 +455,7 @@ def test_any_mode_follows_any_other_without_a_blow(
         if allowed:
             STEPS[step](steered)
         else:
-            with pytest.raises(SetpointError, match='not enabled'):
+            with refuses(SetpointError, name='enabled'):
                 STEPS[step](steered)
         torques += [control.torques for control in steered.ticks(60)]
     assert np.abs(np.diff(torques, axis=0)).max() < most
@@ -572,30 +576,35 @@ def test_command_can_be_changed_on_the_way(moving: Any) -> None:
 UNSTABLE = {'bandwidth': 20.0, 'damping': 2.0}
 
 
-def test_gains_that_are_unstable_at_this_rate_are_refused(drive: Drive) -> None:
+def test_gains_that_are_unstable_at_this_rate_are_refused(
+    drive: Drive, refuses: Refuses,
+) -> None:
     """At 50 Hz, seen from the stamps; nothing changes."""
     driven = drive(armed=False)
     controller = driven.controller
     before = controller.settings
     for tick in range(3):
         controller.tick(10 ** 10 + tick * 20_000_000, driven.angles, NONE, QUIET, NONE, NONE)
-    with pytest.raises(GainError, match=r'^bandwidth 20 rad/s with damping 2 is not stable at 50 '
-                                        r'Hz, at most \d+(\.\d+)? rad/s is$'):
+    with refuses(GainError, name='bandwidth', value=20.0, rate_hz=pytest.approx(50.0)):
         controller.tune(replace(before, **UNSTABLE))
     assert controller.settings is before
     controller.tune(replace(before, bandwidth=3.0))
     assert controller.settings.bandwidth == 3.0
 
 
-def test_unknown_allocation_is_refused_and_changes_nothing(drive: Drive) -> None:
+def test_unknown_allocation_is_refused_and_changes_nothing(
+    drive: Drive, refuses: Refuses,
+) -> None:
     controller = drive().controller
     before = controller.settings
-    with pytest.raises(AllocationError):
+    with refuses(SettingError, name='allocation', value='least', limit=ALLOCATIONS):
         controller.tune(replace(before, allocation='least'))
     assert controller.settings is before
 
 
-def test_gains_too_fast_for_the_rate_that_comes_are_not_driven(paper: Mechanism) -> None:
+def test_gains_too_fast_for_the_rate_that_comes_are_not_driven(
+    paper: Mechanism, refuses: Refuses,
+) -> None:
     """Before the first two ticks the rate is unknown; then it idles, says why, and can be told."""
     settings = ControllerSettings(**UNSTABLE)  # type: ignore[arg-type]
     controller = Controller(paper, settings)
@@ -608,10 +617,12 @@ def test_gains_too_fast_for_the_rate_that_comes_are_not_driven(paper: Mechanism)
         return controller.tick(stamp, angles + 0.01, NONE, QUIET, NONE, NONE)
     controls = [tick() for _ in range(4)]
     assert controller.mode == 'idle'
-    assert controller.problem.startswith('bandwidth 20 rad/s with damping 2 is not stable at 50')
+    assert 'bandwidth 20 rad/s' in controller.problem
+    assert '50 Hz' in controller.problem
     assert not controls[-1].torques.any()
-    with pytest.raises(SetpointError, match='^bandwidth 20 rad/s with damping 2 is not stable'):
+    with refuses(SetpointError, name='idle'):
         controller.setpoint(['link_a'], [0.1])
+    assert controller.last_refusal == controller.problem
     controller.tune(replace(settings, bandwidth=3.0))
     tick()
     assert (controller.mode, controller.problem) == ('hold', '')
@@ -638,7 +649,7 @@ def test_rate_that_falls_makes_it_idle(paper: Mechanism) -> None:
         stamp += 22_000_000
         controller.tick(stamp, angles, NONE, QUIET, NONE, NONE)
     assert controller.mode == 'idle'
-    assert 'not stable at 45.45' in controller.problem
+    assert '45.45 Hz' in controller.problem
     stamp += PERIOD_NS
     controller.tick(stamp, angles, NONE, QUIET, NONE, NONE)
     assert (controller.mode, controller.problem) == ('hold', '')
@@ -661,22 +672,23 @@ def test_rate_that_falls_to_a_whole_fraction_is_noticed_too(times: int, paper: M
         tick(1)
     for _ in range(50):
         assert tick(1) == tick(times) == 'hold'
-    modes = [tick(times) for _ in range(LOST_IN_A_ROW)]
-    assert modes == ['hold'] * (LOST_IN_A_ROW - 2) + ['idle'] * 2
-    assert f'not stable at {250.0 / times:.4g} Hz' in controller.problem
+    modes = [tick(times) for _ in range(SLOWER_TICKS)]
+    assert modes == ['hold'] * (SLOWER_TICKS - 2) + ['idle'] * 2
+    assert f'{250.0 / times:.4g} Hz' in controller.problem
 
 
 # What is asked for
 
 def test_more_than_the_wheels_bear_is_refused_with_the_shortest_duration(drive: Drive) -> None:
     driven = drive(setpoint_duration=1.0)
-    with pytest.raises(SetpointError, match=r'^needs .* on flywheel_\w, limit .*; shortest '
-                                            r'duration is (\S+) s$') as caught:
+    with pytest.raises(SetpointError) as caught:
         quarter_turn(driven)
+    assert caught.value.values['value'] > caught.value.values['limit']
+    assert caught.value.values['name'] in FLYWHEEL_NAMES
     controller = driven.controller
     assert (controller.accepted, controller.refused) == (0, 1)
     assert controller.last_refusal == str(caught.value)
-    shortest = float(str(caught.value).split()[-2])
+    shortest = caught.value.values['duration']
     controller.tune(replace(controller.settings, setpoint_duration=shortest))
     quarter_turn(driven)
     assert controller.accepted == 1
@@ -692,7 +704,7 @@ def test_shortest_timing_takes_as_long_as_the_wheels_need(
     refused = steer(mechanism, setpoint_duration=1.0)
     with pytest.raises(SetpointError) as caught:
         refused.controller.setpoint(['link_a', 'link_b'], goal)
-    shortest = float(str(caught.value).split()[-2])
+    shortest = caught.value.values['duration']
     steered = steer(mechanism, setpoint_duration=1.0, setpoint_timing='shortest')
     steered.controller.setpoint(['link_a', 'link_b'], goal)
     errors = []
@@ -722,21 +734,22 @@ def test_trajectory_goes_through_its_points_in_time(drive: Drive) -> None:
     assert driven.controller.saturated == 0
 
 
-@pytest.mark.parametrize(('names', 'points', 'reason'), [
-    ([], [Point([], 5.0)], 'named'),
-    (['link_a'], [], 'point'),
-    (['link_x'], [Point([0.1], 5.0)], 'link_x'),
-    (['link_a'], [Point([float('nan')], 5.0)], 'nan'),
-    (['link_a'], [Point([0.1], 5.0, effort=[1.0])], 'effort'),
-    (['link_a'], [Point([0.1], 5.0), Point([0.2], 4.0)], 'time'),
-    (['link_a', 'link_b'], [Point([pi / 2, pi], 0.5)], '^needs '),
-    (['link_b'], [Point([0.0], 10.0)], 'change point')])
+@pytest.mark.parametrize(('names', 'points', 'values'), [
+    ([], [Point([], 5.0)], {'kind': 'length'}),
+    (['link_a'], [], {'name': 'points'}),
+    (['link_x'], [Point([0.1], 5.0)], {'kind': 'names'}),
+    (['link_a'], [Point([float('nan')], 5.0)], {'point': 1, 'name': 'position'}),
+    (['link_a'], [Point([0.1], 5.0, effort=[1.0])], {'point': 1, 'name': 'effort'}),
+    (['link_a'], [Point([0.1], 5.0), Point([0.2], 4.0)], {'point': 2, 'name': 'time'}),
+    (['link_a', 'link_b'], [Point([pi / 2, pi], 0.5)], {'name': 'flywheel_b'}),
+    (['link_b'], [Point([0.0], 10.0)], {'name': 'change_point'})])
 def test_trajectory_is_refused_whole(
-    names: list[str], points: list[Point], reason: str, drive: Drive,
+    names: list[str], points: list[Point], values: dict[str, Any], drive: Drive,
 ) -> None:
     driven = drive()
-    with pytest.raises(SetpointError, match=reason) as caught:
+    with pytest.raises(SetpointError) as caught:
         driven.controller.trajectory(names, points)
+    assert values.items() <= caught.value.values.items()
     controller = driven.controller
     assert (controller.accepted, controller.refused, controller.mode) == (0, 1, 'hold')
     assert controller.last_refusal == str(caught.value)
@@ -745,18 +758,20 @@ def test_trajectory_is_refused_whole(
 
 
 @pytest.mark.parametrize('offset_s', [-1.1, 1.1])
-def test_trajectory_with_a_foreign_stamp_is_refused(offset_s: float, drive: Drive) -> None:
+def test_trajectory_with_a_foreign_stamp_is_refused(
+    offset_s: float, drive: Drive, refuses: Refuses,
+) -> None:
     driven = drive()
-    with pytest.raises(SetpointError, match='before the last tick'):
+    with refuses(SetpointError, name='stamp', value=pytest.approx(-offset_s)):
         driven.controller.trajectory(
             ['link_a'], [Point([0.1], 5.0)], driven.stamp_ns + round(offset_s * 1e9))
 
 
-def test_change_points_are_avoided_or_kept(drive: Drive) -> None:
+def test_change_points_are_avoided_or_kept(drive: Drive, refuses: Refuses) -> None:
     """To the other side of theta = 0, or to rest on it: only where it may cross."""
     for goal in (-0.3, 0.0):
         avoiding = drive(phi_b=0.3)
-        with pytest.raises(SetpointError, match='change point'):
+        with refuses(SetpointError, name='change_point'):
             avoiding.controller.setpoint(['link_b'], [goal])
         keeping = drive(phi_b=0.3, change_points='keep')
         keeping.controller.setpoint(['link_b'], [goal])
@@ -773,10 +788,10 @@ def test_it_crosses_a_change_point_on_its_branch(
     steered = steer(prototype, InitialState(0.1, 0.5), setpoint_duration=3.0, command=command,
                     change_points='keep')
     steered.controller.setpoint(['link_a', 'link_b'], [0.2, -0.3])
-    apart = []
+    pair_angle = []
     for _ in range(1000):
         steered.tick()
         angles = steered.plant.truth().link_angles
-        apart.append(wrap_angles(angles[2:] - angles[:2]))
-    assert np.abs(apart).max() < 1e-3
+        pair_angle.append(wrap_angles(angles[2:] - angles[:2]))
+    assert np.abs(pair_angle).max() < 1e-3
     np.testing.assert_allclose(steered.plant.truth().link_angles[:2], [0.2, -0.3], atol=1e-4)

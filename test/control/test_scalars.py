@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is told besides commands is what physics and the law say it is."""
+"""Scalars of the topics `allocation` and `momentum` against physics and the law."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fourbar_ros.control.scalars import (
     MOMENTUM,
     momentum_scalars,
 )
-from fourbar_ros.control.tracking_law import SHARED_OUT
+from fourbar_ros.control.tracking_law import MOTOR_SHARE
 from fourbar_ros.mechanism import angular_momentum, assemble, Mechanism, reduced_form
 from fourbar_ros.mechanism.dynamics import mass_matrix
 from fourbar_ros.plant import InitialState
@@ -123,14 +123,14 @@ def test_scale_and_saturated_wheels(uneven: Mechanism) -> None:
     controller.tick(10 ** 9, angles, NONE, QUIET, NONE, NONE)
     assert allocation_of(controller)['scale'] == 1.0
     controller.tick(10 ** 9 + 4_000_000, assemble(uneven, 0.8, 1.2), NONE, QUIET, NONE, NONE)
-    found, decided = allocation_of(controller), controller.law.decision
-    assert found['scale'] == decided.scale < 1.0
+    found, output = allocation_of(controller), controller.law.output
+    assert found['scale'] == output.scale < 1.0
     at_bound = [found[f'saturated_{link}'] for link in LINKS]
     # All in proportion: just the one that is at its bound limits them.
     assert sum(at_bound) == 1.0
     wheel = at_bound.index(1.0)
-    assert abs(decided.torques[wheel]) == pytest.approx(
-        SHARED_OUT['effort'] * 1e-4, rel=1e-6)
+    assert abs(output.torques[wheel]) == pytest.approx(
+        MOTOR_SHARE['effort'] * 1e-4, rel=1e-6)
     assert found['branch_hold'] == 0.0
     form = reduced_form(uneven, assemble(uneven, 0.8, 1.2), NONE)
     assert found['condition_number'] == pytest.approx(np.linalg.cond(form.mass_matrix), rel=1e-9)
@@ -163,8 +163,11 @@ def test_null_speeds_are_what_moves_no_axis(paper: Mechanism, uneven: Mechanism)
 
 
 def test_time_left_is_named_only_if_it_comes(prototype: Mechanism) -> None:
-    controller = ticked(prototype, assemble(prototype, 0.0, 1.0), NONE, np.full(4, 50.0))
+    speeds = np.full(4, 50.0)
+    controller = ticked(prototype, assemble(prototype, 0.0, 1.0), NONE, speeds)
     assert 'time_left_s' not in momentum_of(controller)
+    # One long period of rest is enough of an observation.
+    controller.momentum.reset(speeds)
+    controller.momentum.update(100.0, speeds, NONE, NONE)
     controller.momentum.drift[:] = [5.0, 0.0, 0.0, 0.0]
-    controller.momentum._since = 100.0
     assert momentum_of(controller)['time_left_s'] == pytest.approx(50.0)

@@ -3,20 +3,22 @@
 
 """Points with times become one smooth motion through them, or are refused with their number."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from itertools import combinations
 from math import inf, nan, pi
 from typing import Any
 
 from fourbar_ros.control.setpoint import SetpointError
 from fourbar_ros.control.soft_step import SoftStep
-from fourbar_ros.control.trajectory import MOST_POINTS, Point, read_trajectory, Trajectory
+from fourbar_ros.control.trajectory import MAX_POINTS, Point, read_trajectory, Trajectory
 from fourbar_ros.mechanism import assemble, closure_error, LINK_NAMES, Mechanism
 import numpy as np
 from numpy.typing import NDArray
 import pytest
 
 Array = NDArray[np.float64]
+Refuses = Callable[..., AbstractContextManager[None]]
 A_AND_B = LINK_NAMES[:2]
 MOVING = np.array([[0.2, 1.5], [0.05, -0.08], [0.02, 0.03]])
 
@@ -224,21 +226,22 @@ def test_from_point_to_point_links_take_the_shortest_way(paper: Mechanism) -> No
     np.testing.assert_allclose(trajectory.at(3.0)[0, 0], 2 * pi - 2.5, atol=1e-9)
 
 
-def test_first_point_at_time_0_is_where_it_is(paper: Mechanism) -> None:
+def test_first_point_at_time_0_is_where_it_is(paper: Mechanism, refuses: Refuses) -> None:
     there = Point((0.2005 + 2 * pi, 1.5), 0.0)
     rest = [Point((0.3, 1.6), 2.0), Point((0.4, 1.6), 4.0)]
     with_it, _ = read(paper, A_AND_B, [there, *rest])
     without, _ = read(paper, A_AND_B, rest)
     np.testing.assert_array_equal(with_it.states, without.states)
-    with pytest.raises(SetpointError, match='point 1 of 3: link_a at time 0 is 0.2020 rad and the '
-                                            'reference 0.2000 rad, limit 0.001 rad'):
+    with refuses(SetpointError, point=1, name='link_a', value=pytest.approx(0.202), limit=0.2):
         read(paper, A_AND_B, [Point((0.202, 1.5), 0.0), *rest])
 
 
 # Change points
 
 @pytest.mark.parametrize('names', [('link_a', 'link_b'), ('link_d', 'link_c'), ('link_b',)])
-def test_where_allowed_it_crosses_change_points(names: Sequence[str], paper: Mechanism) -> None:
+def test_where_allowed_it_crosses_change_points(
+    names: Sequence[str], paper: Mechanism, refuses: Refuses,
+) -> None:
     """There and back through theta = 0, with a point on it that is passed at a given rate."""
     start = np.array([[0.2, 0.8], [0.0, 0.0], [0.0, 0.0]])
     axes = [LINK_NAMES.index(name) % 2 for name in names]
@@ -248,7 +251,7 @@ def test_where_allowed_it_crosses_change_points(names: Sequence[str], paper: Mec
     trajectory, end = read(paper, names, points, start, crossing=True)
     np.testing.assert_allclose(trajectory.at(2.0)[:2], [[0.2, 0.2], [0.0, -0.3]], atol=1e-12)
     np.testing.assert_allclose(end, 0.2, atol=1e-12)
-    with pytest.raises(SetpointError, match='change point'):
+    with refuses(SetpointError, name='change_point'):
         read(paper, names, points, start)
 
 
@@ -257,55 +260,63 @@ def test_where_allowed_it_crosses_change_points(names: Sequence[str], paper: Mec
 GOOD = Point((0.3, 1.6), 1.0)
 
 
-@pytest.mark.parametrize(('names', 'points', 'needle'), [
-    ([], [GOOD], 'nothing is named'),
-    (['link_a', 'link_x'], [GOOD], "'link_x'"),
-    (['link_a', 'link_a'], [GOOD], 'link_a is named twice'),
-    (A_AND_B, [], '0 points'),
-    (A_AND_B, [GOOD] * (MOST_POINTS + 1), f'at most {MOST_POINTS}'),
-    (A_AND_B, [GOOD, Point((), 2.0)], 'point 2 of 2: no positions'),
-    (A_AND_B, [GOOD, Point((0.3,), 2.0)], 'point 2 of 2: 2 names but 1 of position'),
-    (A_AND_B, [GOOD, Point((0.3, 1.6), 2.0, (0.0,))], '2 names but 1 of velocity'),
-    (A_AND_B, [Point((0.3, 1.6), 1.0, (0.0,) * 2, (0.0,) * 3)], '2 names but 3 of acceleration'),
-    (A_AND_B, [Point((0.3, nan), 1.0)], 'point 1 of 1: position of link_b is nan'),
+@pytest.mark.parametrize(('names', 'points', 'values'), [
+    ([], [GOOD], {'kind': 'length'}),
+    (['link_a', 'link_x'], [GOOD], {'kind': 'names'}),
+    (['link_a', 'link_a'], [GOOD], {'kind': 'names'}),
+    (A_AND_B, [], {'name': 'points', 'value': 0}),
+    (A_AND_B, [GOOD] * (MAX_POINTS + 1), {'name': 'points', 'limit': (1, MAX_POINTS)}),
+    (A_AND_B, [GOOD, Point((), 2.0)], {'point': 2, 'name': 'position', 'value': ()}),
+    (A_AND_B, [GOOD, Point((0.3,), 2.0)], {'point': 2, 'name': 'position', 'value': (0.3,)}),
+    (A_AND_B, [GOOD, Point((0.3, 1.6), 2.0, (0.0,))],
+     {'point': 2, 'name': 'velocity', 'value': (0.0,)}),
+    (A_AND_B, [Point((0.3, 1.6), 1.0, (0.0,) * 2, (0.0,) * 3)],
+     {'point': 1, 'name': 'acceleration', 'value': (0.0,) * 3}),
+    (A_AND_B, [Point((0.3, nan), 1.0)],
+     {'point': 1, 'name': 'position', 'value': pytest.approx(nan, nan_ok=True)}),
     (A_AND_B, [Point((0.3, 1.6), 1.0, (inf, 0.0)), Point((0.3, 1.6), 2.0)],
-     'point 1 of 2: velocity of link_a is inf'),
+     {'point': 1, 'name': 'velocity', 'value': inf}),
     (A_AND_B, [Point((0.3, 1.6), 1.0, (0.0, 0.0), (0.0, -inf)), Point((0.3, 1.6), 2.0)],
-     'point 1 of 2: acceleration of link_b is -inf'),
-    (A_AND_B, [Point((0.3, 1.6), nan)], 'point 1 of 1: time is nan s'),
-    (A_AND_B, [Point((0.3, 1.6), -0.5)], 'point 1 of 1: time is -0.5 s, must not be negative'),
-    (A_AND_B, [GOOD, GOOD], 'point 2 of 2: time is 1 s, not after 1 s'),
-    (A_AND_B, [GOOD, Point((0.3, 1.6), 0.5)], 'point 2 of 2: time is 0.5 s, not after 1 s'),
-    (A_AND_B, [Point((0.3, 1.6), 1e-6)], 'less than 0.001 s after'),
-    (A_AND_B, [GOOD, Point((0.3, 1.6), 1.0 + 1e-6)], 'point 2 of 2'),
-    (A_AND_B, [Point((0.2, 1.5), 0.0)], 'no time to move'),
+     {'point': 1, 'name': 'acceleration', 'value': -inf}),
+    (A_AND_B, [Point((0.3, 1.6), nan)],
+     {'point': 1, 'name': 'time', 'value': pytest.approx(nan, nan_ok=True)}),
+    (A_AND_B, [Point((0.3, 1.6), -0.5)], {'point': 1, 'name': 'time', 'value': -0.5}),
+    (A_AND_B, [GOOD, GOOD], {'point': 2, 'name': 'time', 'value': 1.0}),
+    (A_AND_B, [GOOD, Point((0.3, 1.6), 0.5)], {'point': 2, 'name': 'time', 'value': 0.5}),
+    (A_AND_B, [Point((0.3, 1.6), 1e-6)], {'point': 1, 'name': 'time', 'value': 1e-6}),
+    (A_AND_B, [GOOD, Point((0.3, 1.6), 1.0 + 1e-6)], {'point': 2, 'name': 'time'}),
+    (A_AND_B, [Point((0.2, 1.5), 0.0)], {'point': 1, 'name': 'time', 'value': 0.0}),
     (A_AND_B, [Point((0.3, 1.6), 1.0, (0.0, 0.1))],
-     'point 1 of 1: velocity of link_b is 0.1, must be 0 in the last point'),
-    (A_AND_B, [Point((0.3, 1.6), 1.0, (0.0, 0.0), (0.2, 0.0))], 'acceleration of link_a is 0.2'),
-    (A_AND_B, [Point((0.3, 1.6), 1.0, (), (0.0, 0.0))], 'no velocities'),
-    (A_AND_B, [GOOD, Point((0.3, 1.6), 2.0, effort=(0.0, 0.0))], 'point 2 of 2: effort is given'),
-    (A_AND_B, [Point((0.3, 1.6), 1.0, (1e300, 0.0)), Point((0.3, 1.6), 2.0)], 'can be checked'),
-    (('link_a', 'link_b', 'link_c'), [Point((0.3, 1.6, 1.0), 1.0)], 'point 1 of 1: link_c would'),
-    (('link_a', 'link_c'), [Point((0.3, 0.3), 1.0)], 'point 1 of 1: link_a = 0.3000 rad and'),
+     {'point': 1, 'name': 'velocity', 'value': 0.1}),
+    (A_AND_B, [Point((0.3, 1.6), 1.0, (0.0, 0.0), (0.2, 0.0))],
+     {'point': 1, 'name': 'acceleration', 'value': 0.2}),
+    (A_AND_B, [Point((0.3, 1.6), 1.0, (), (0.0, 0.0))], {'point': 1, 'name': 'velocity'}),
+    (A_AND_B, [GOOD, Point((0.3, 1.6), 2.0, effort=(0.0, 0.0))],
+     {'point': 2, 'name': 'effort', 'value': (0.0, 0.0)}),
+    (A_AND_B, [Point((0.3, 1.6), 1.0, (1e300, 0.0)), Point((0.3, 1.6), 2.0)], {'name': 'turn'}),
+    (('link_a', 'link_b', 'link_c'), [Point((0.3, 1.6, 1.0), 1.0)],
+     {'point': 1, 'name': 'link_c', 'limit': 1.0}),
+    (('link_a', 'link_c'), [Point((0.3, 0.3), 1.0)],
+     {'point': 1, 'names': ['link_a', 'link_c']}),
     (('link_a', 'link_b', 'link_c'),
      [Point((0.3, 1.6, 0.3), 1.0, (0.1, 0.0, 0.2)), Point((0.3, 1.6, 0.3), 2.0)],
-     'point 1 of 2: velocity of link_c would be 0.1000 and not 0.2000'),
+     {'point': 1, 'name': 'velocity', 'link': 'link_c', 'value': pytest.approx(0.1),
+      'limit': 0.2}),
 ])
-def test_refused_with_reason(
-    names: Sequence[str], points: Sequence[Any], needle: str, paper: Mechanism,
+def test_refused_with_its_values(
+    names: Sequence[str], points: Sequence[Any], values: dict[str, Any], paper: Mechanism,
+    refuses: Refuses,
 ) -> None:
-    with pytest.raises(SetpointError) as caught:
+    with refuses(SetpointError, **values):
         read(paper, names, points)
-    assert needle in str(caught.value)
-    assert '\n' not in str(caught.value)
 
 
-def test_what_the_linkage_cannot_take_is_refused(uneven: Mechanism) -> None:
+def test_what_the_linkage_cannot_take_is_refused(uneven: Mechanism, refuses: Refuses) -> None:
     other = assemble(uneven, 0.2, 1.5, 'crossed')
-    with pytest.raises(SetpointError, match='point 1 of 1: .*branch'):
+    with refuses(SetpointError, point=1):
         read(uneven, LINK_NAMES[:3], [Point(other[:3].tolist(), 1.0)])
     long = Mechanism(  # type: ignore[arg-type]
         [0.3, 0.3, 0.2, 0.2], [0.02] * 4, [2e-5] * 4, [[0.05, 0.0]] * 4, [3e-7] * 4)
     start = np.array([[0.0, 1.0], [0.0, 0.0], [0.0, 0.0]])
-    with pytest.raises(SetpointError, match='point 2 of 2: the loop cannot close at .*2.5000'):
+    with refuses(SetpointError, point=2):
         read(long, A_AND_B, [Point((0.0, 1.1), 1.0), Point((0.0, 2.5), 2.0)], start)

@@ -42,7 +42,7 @@ def giving(mechanism: Mechanism) -> Mechanism:
 
 def pose(branch: Branch, heading: float, theta: float) -> tuple[float, ...]:
     path = np.array([heading, heading + theta])
-    return tuple(branch.spread(path, np.full(2, branch.apart)).tolist())
+    return tuple(branch.to_links(path, np.full(2, branch.pair_angle)).tolist())
 
 
 @pytest.mark.parametrize('seed', SEEDS)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from math import pi
 
 from fourbar_ros.control import Controller, ControllerSettings
-from fourbar_ros.control.actuation_cost import FLYWHEEL_ENERGY
+from fourbar_ros.control.actuation_cost_sums import FLYWHEEL_ENERGY
 from fourbar_ros.device import DeviceState, DeviceSupervisor, SupervisorSettings
 from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.estimation import Estimator, EstimatorSettings

@@ -6,7 +6,7 @@
 from dataclasses import replace
 from math import pi
 
-from fourbar_ros.control.actuation_cost import ENERGIES
+from fourbar_ros.control.actuation_cost_sums import ENERGIES
 from fourbar_ros.loop import load_scenario, record_run, Scenario
 from fourbar_ros.mechanism import assemble, reduced_form
 import numpy as np

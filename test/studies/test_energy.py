@@ -8,7 +8,7 @@ from dataclasses import replace
 import io
 from math import pi
 
-from fourbar_ros.control.allocation import mobilities
+from fourbar_ros.control.allocation import make_allocation, WeightedNorm
 from fourbar_ros.mechanism import (
     angular_momentum,
     assemble,
@@ -39,7 +39,7 @@ ODD = Mechanism(
 def odd_step(speeds=None, law: str = 'min_norm'):
     return actuation_cost(
         ODD, rest_to_rest(1.2, (0.9, 0.3), 2.0), assemble(ODD, 0.0, 1.2),
-        mobilities(law, ODD.flywheel_inertias, [True] * 4), speeds)
+        make_allocation(law, ODD.flywheel_inertias, [True] * 4), speeds)
 
 
 def test_study_passes_its_checks_and_has_its_keys() -> None:
@@ -115,4 +115,4 @@ def test_nothing_is_below_the_least_and_balancing_reaches_it() -> None:
 def test_wheels_of_one_pair_cannot_turn_the_other(refuses) -> None:
     with refuses(ActuationCostError, value=pytest.approx(1.0), limit=1e-9):
         actuation_cost(PAPER, rest_to_rest(1.0, (1.0, 1.0), 5.0), assemble(PAPER, 0.0, 1.0),
-                       np.array([1.0, 0.0, 1.0, 0.0]))
+                       WeightedNorm(np.array([1.0, 0.0, 1.0, 0.0])))

@@ -17,7 +17,7 @@ import time
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.control.actuation_cost import COPPER, EQ9, WORK
+from fourbar_ros.control.actuation_cost_sums import COPPER, EQ9, WORK
 from fourbar_ros.loop import make_loop, run_scenario, Scenario, Step
 from fourbar_ros.loop.warm_up import warm_up
 from fourbar_ros.mechanism import LINK_NAMES

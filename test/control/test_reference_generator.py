@@ -8,7 +8,7 @@ from __future__ import annotations
 from math import pi, sin
 
 from fourbar_ros.control.reference_generator import ReferenceGenerator, STOPPING_TIME
-from fourbar_ros.control.setpoint import follow
+from fourbar_ros.control.setpoint import follow_path
 from fourbar_ros.control.soft_step import SoftStep
 from fourbar_ros.mechanism import assemble, closure_error, Mechanism, reduced_form
 from fourbar_ros.mechanism.change_points import PLANNING_MARGIN
@@ -25,27 +25,29 @@ SEEDS = range(10)
 each_seed = pytest.mark.parametrize('seed', SEEDS)
 
 
-def moving_guide(mechanism: Mechanism, angles: Array, travel: Array, duration: float,
+def moving_reference(mechanism: Mechanism, angles: Array, travel: Array, duration: float,
                  seconds: float) -> tuple[ReferenceGenerator, int]:
-    """Return a guide after some time of a move, and the stamp."""
-    guide = ReferenceGenerator(mechanism)
-    guide.begin(angles)
-    step = SoftStep(guide.motion.copy(), guide.motion[0] + travel, duration)
-    guide.go(step, follow(mechanism, step, guide.angles, crossing=guide.paired)[-1], 10 ** 9)
+    """Return a reference after some time of a move, and the stamp."""
+    reference = ReferenceGenerator(mechanism)
+    reference.rest_at(angles)
+    step = SoftStep(reference.motion.copy(), reference.motion[0] + travel, duration)
+    end = follow_path(mechanism, step, reference.angles, crossing=reference.paired)[-1]
+    reference.start(step, end, 10 ** 9)
     now = 10 ** 9
     for _ in range(round(seconds / PERIOD)):
         now += PERIOD_NS
-        guide.follow(now)
-    return guide, now
+        reference.advance(now)
+    return reference, now
 
 
-def run(guide: ReferenceGenerator, now: int, seconds: float) -> tuple[Array, Array, Array]:
+def run(reference: ReferenceGenerator, now: int, seconds: float) -> tuple[Array, Array, Array]:
     """Go on, and return angles, rates and accelerations (n, 4), the present first."""
-    found = [(guide.angles.copy(), guide.rates.copy(), guide.accelerations.copy())]
+    found = [(reference.angles.copy(), reference.rates.copy(), reference.accelerations.copy())]
     for _ in range(round(seconds / PERIOD)):
         now += PERIOD_NS
-        guide.follow(now)
-        found.append((guide.angles.copy(), guide.rates.copy(), guide.accelerations.copy()))
+        reference.advance(now)
+        found.append((
+            reference.angles.copy(), reference.rates.copy(), reference.accelerations.copy()))
     angles, rates, accelerations = (np.array(values) for values in zip(*found))
     return angles, rates, accelerations
 
@@ -61,14 +63,14 @@ def check_continuous(angles: Array, rates: Array, jerk: float) -> None:
 # Where it begins
 
 def test_it_stands_where_the_links_are(uneven: Mechanism) -> None:
-    guide, angles = ReferenceGenerator(uneven), assemble(uneven, 0.3, 1.5)
-    guide.begin(angles)
-    np.testing.assert_array_equal(guide.angles, angles)
-    np.testing.assert_array_equal(guide.destination, angles)
-    assert not guide.paired
-    assert not guide.moving
-    assert guide.goal is None
-    assert not guide.motion[1:].any()
+    reference, angles = ReferenceGenerator(uneven), assemble(uneven, 0.3, 1.5)
+    reference.rest_at(angles)
+    np.testing.assert_array_equal(reference.angles, angles)
+    np.testing.assert_array_equal(reference.destination, angles)
+    assert not reference.paired
+    assert not reference.moving
+    assert reference.goal is None
+    assert not reference.motion[1:].any()
 
 
 @pytest.mark.parametrize('turns_c', [0, 1, -3])
@@ -78,41 +80,42 @@ def test_pairs_are_parallel_on_whatever_turns_they_are(
     theta: float, turns_c: int, turns_d: int, paper: Mechanism,
 ) -> None:
     """It is nearest to what it was given, and not a jump by turns."""
-    guide = ReferenceGenerator(paper)
+    reference = ReferenceGenerator(paper)
     off = np.array([1e-3, -2e-3, -1e-3, 4e-3])
     turns = 2.0 * pi * np.array([0, 0, turns_c, turns_d])
     measured = 0.4 + np.array([0.0, theta, 0.0, theta]) + off + turns
-    guide.begin(measured)
-    assert guide.paired
+    reference.rest_at(measured)
+    assert reference.paired
     np.testing.assert_allclose(
-        guide.angles[2:] - guide.angles[:2], 2.0 * pi * np.array([turns_c, turns_d]), atol=1e-12)
+        reference.angles[2:] - reference.angles[:2], 2.0 * pi * np.array([turns_c, turns_d]),
+        atol=1e-12)
     # The mean of each pair: half of the difference is left.
-    np.testing.assert_allclose(np.abs(guide.angles - measured), [1e-3, 3e-3, 1e-3, 3e-3],
+    np.testing.assert_allclose(np.abs(reference.angles - measured), [1e-3, 3e-3, 1e-3, 3e-3],
                                atol=1e-12)
-    step = SoftStep(guide.motion.copy(), guide.motion[0] + 0.3, 1.0)
-    guide.go(step, guide.angles + 0.3, 10 ** 9)
-    before = guide.angles.copy()
-    assert not guide.follow(10 ** 9)
-    np.testing.assert_allclose(guide.angles, before, atol=1e-12)
-    assert guide.follow(2 * 10 ** 9)
-    np.testing.assert_allclose(guide.angles, before + 0.3, atol=1e-12)
+    step = SoftStep(reference.motion.copy(), reference.motion[0] + 0.3, 1.0)
+    reference.start(step, reference.angles + 0.3, 10 ** 9)
+    before = reference.angles.copy()
+    assert not reference.advance(10 ** 9)
+    np.testing.assert_allclose(reference.angles, before, atol=1e-12)
+    assert reference.advance(2 * 10 ** 9)
+    np.testing.assert_allclose(reference.angles, before + 0.3, atol=1e-12)
 
 
 @each_seed
 def test_links_c_and_d_follow_by_closure(seed: int, uneven: Mechanism) -> None:
     rng = np.random.default_rng(seed)
     angles = assemble(uneven, 0.3, 1.5)
-    guide, now = moving_guide(uneven, angles, rng.uniform(-0.4, 0.4, 2), 2.0, 0.8)
-    assert closure_error(uneven, guide.angles) < 1e-15
-    gamma = reduced_form(uneven, guide.angles, guide.rates).gamma
-    np.testing.assert_allclose(guide.rates[2:], gamma @ guide.rates[:2], rtol=1e-12)
-    assert guide.time_left(now) == pytest.approx(1.2)
-    reached, rates, _ = run(guide, now, 1.2)
+    reference, now = moving_reference(uneven, angles, rng.uniform(-0.4, 0.4, 2), 2.0, 0.8)
+    assert closure_error(uneven, reference.angles) < 1e-15
+    gamma = reduced_form(uneven, reference.angles, reference.rates).gamma
+    np.testing.assert_allclose(reference.rates[2:], gamma @ reference.rates[:2], rtol=1e-12)
+    assert reference.time_left(now) == pytest.approx(1.2)
+    reached, rates, _ = run(reference, now, 1.2)
     # Third derivatives of a quintic by 0.4 rad in 2 s, a and b, and what the gearing makes of it.
     check_continuous(reached, rates, 60.0 * 0.4 / 2.0 ** 3 * 10.0)
-    assert not guide.moving
-    assert not guide.rates.any()
-    np.testing.assert_allclose(guide.angles, guide.goal, atol=1e-9)
+    assert not reference.moving
+    assert not reference.rates.any()
+    np.testing.assert_allclose(reference.angles, reference.goal, atol=1e-9)
 
 
 # Giving up
@@ -123,49 +126,49 @@ def test_halt_comes_to_rest_soon_without_a_jump(
     linkage: str, seconds: float, request: pytest.FixtureRequest,
 ) -> None:
     mechanism = request.getfixturevalue(linkage)
-    guide, now = moving_guide(
+    reference, now = moving_reference(
         mechanism, assemble(mechanism, 0.3, 1.5), np.array([0.4, 0.3]), 2.0, seconds)
-    motion = guide.motion.copy()
-    guide.halt(now)
-    assert guide.goal is not None
-    guide.follow(now)
+    motion = reference.motion.copy()
+    reference.stop(now)
+    assert reference.goal is not None
+    reference.advance(now)
     # Angle, rate and acceleration are taken over.
-    np.testing.assert_allclose(guide.motion, motion, atol=1e-12)
-    angles, rates, _ = run(guide, now, STOPPING_TIME + 2.0 * PERIOD)
+    np.testing.assert_allclose(reference.motion, motion, atol=1e-12)
+    angles, rates, _ = run(reference, now, STOPPING_TIME + 2.0 * PERIOD)
     check_continuous(angles, rates, 60.0 * 10.0)
     assert not rates[-1].any()
-    assert not guide.moving
+    assert not reference.moving
     # No farther than it would have gone at this rate, or as the acceleration took it.
     reach = np.abs(motion[1]) * STOPPING_TIME + 0.5 * np.abs(motion[2]) * STOPPING_TIME ** 2
     assert (np.abs(angles[:, :2] - motion[0]) <= reach + 1e-12).all()
 
 
 def test_halt_at_rest_changes_nothing(paper: Mechanism) -> None:
-    guide = ReferenceGenerator(paper)
-    guide.begin(assemble(paper, 0.3, 1.5))
-    before = guide.angles.copy()
-    guide.halt(10 ** 9)
-    assert not guide.moving
-    np.testing.assert_array_equal(guide.angles, before)
+    reference = ReferenceGenerator(paper)
+    reference.rest_at(assemble(paper, 0.3, 1.5))
+    before = reference.angles.copy()
+    reference.stop(10 ** 9)
+    assert not reference.moving
+    np.testing.assert_array_equal(reference.angles, before)
 
 
 @each_seed
 def test_moving_links_are_taken_over(seed: int, uneven: Mechanism) -> None:
     """The reference begins with the rates that they have, and stops within its time."""
     rng = np.random.default_rng(seed)
-    guide, angles = ReferenceGenerator(uneven), assemble(uneven, 0.3, 1.5)
+    reference, angles = ReferenceGenerator(uneven), assemble(uneven, 0.3, 1.5)
     rates = np.zeros(4)
     rates[:2] = rng.uniform(-0.3, 0.3, 2)
     rates[2:] = reduced_form(uneven, angles, rates).gamma @ rates[:2]
-    guide.move_from(angles, rates, 10 ** 9)
-    assert guide.goal is None
-    assert guide.moving
-    guide.follow(10 ** 9)
-    np.testing.assert_allclose(guide.rates, rates, rtol=1e-12)
-    np.testing.assert_allclose(guide.angles, angles, atol=1e-12)
-    reached, speeds, _ = run(guide, 10 ** 9, STOPPING_TIME)
+    reference.stop_from(angles, rates, 10 ** 9)
+    assert reference.goal is None
+    assert reference.moving
+    reference.advance(10 ** 9)
+    np.testing.assert_allclose(reference.rates, rates, rtol=1e-12)
+    np.testing.assert_allclose(reference.angles, angles, atol=1e-12)
+    reached, speeds, _ = run(reference, 10 ** 9, STOPPING_TIME)
     check_continuous(reached, speeds, 60.0 * 10.0)
-    assert not guide.rates.any()
+    assert not reference.rates.any()
     # A quintic from a rate to rest over half of rate times time turns back nowhere.
     assert (reached[1:, :2] - reached[:-1, :2]) @ np.diag(np.sign(rates[:2])) == pytest.approx(
         np.abs(np.diff(reached[:, :2], axis=0)), abs=1e-15)
@@ -194,13 +197,13 @@ def test_it_comes_to_rest_before_a_change_point(
     sine: float, rate: float, at_once: bool, folding: Mechanism,
 ) -> None:
     """In less time the nearer that is; at once if there is no time."""
-    guide, angles = ReferenceGenerator(folding), near_change_point(folding, sine)
+    reference, angles = ReferenceGenerator(folding), near_change_point(folding, sine)
     assert abs(sin(angles[3] - angles[2])) == pytest.approx(sine, rel=1e-9)
     rates = np.array([0.0, rate, 0.0, 0.0])
     rates[2:] = reduced_form(folding, angles, rates).gamma @ rates[:2]
-    guide.move_from(angles, rates, 10 ** 9)
-    assert guide.moving == (not at_once)
-    reached, speeds, _ = run(guide, 10 ** 9, STOPPING_TIME)
+    reference.stop_from(angles, rates, 10 ** 9)
+    assert reference.moving == (not at_once)
+    reached, speeds, _ = run(reference, 10 ** 9, STOPPING_TIME)
     sines = np.abs(np.sin(reached[:, 3] - reached[:, 2]))
     assert sines[-1] < sine or at_once
     assert sines.min() >= PLANNING_MARGIN - 1e-6
@@ -208,10 +211,10 @@ def test_it_comes_to_rest_before_a_change_point(
 
 
 def test_on_the_parallelogram_a_change_point_is_no_obstacle(paper: Mechanism) -> None:
-    guide = ReferenceGenerator(paper)
+    reference = ReferenceGenerator(paper)
     rates = np.tile([0.0, 0.3], 2)
-    guide.move_from(np.array([0.2, 0.15, 0.2, 0.15]), rates, 10 ** 9)
-    reached, _, _ = run(guide, 10 ** 9, STOPPING_TIME)
+    reference.stop_from(np.array([0.2, 0.15, 0.2, 0.15]), rates, 10 ** 9)
+    reached, _, _ = run(reference, 10 ** 9, STOPPING_TIME)
     theta = reached[:, 1] - reached[:, 0]
     assert theta[0] < 0.0 < theta[-1]
     np.testing.assert_allclose(reached[:, 2:], reached[:, :2], atol=1e-15)
@@ -219,11 +222,12 @@ def test_on_the_parallelogram_a_change_point_is_no_obstacle(paper: Mechanism) ->
 
 
 def test_following_the_links_it_has_no_motion_of_its_own(paper: Mechanism) -> None:
-    guide, _ = moving_guide(paper, assemble(paper, 0.3, 1.5), np.array([0.4, 0.3]), 2.0, 0.8)
+    reference, _ = moving_reference(
+        paper, assemble(paper, 0.3, 1.5), np.array([0.4, 0.3]), 2.0, 0.8)
     here = assemble(paper, 0.5, 1.4)
-    guide.stand_at(here)
-    np.testing.assert_array_equal(guide.angles, here)
-    assert not guide.moving
-    assert not guide.rates.any()
-    assert not guide.motion[1:].any()
-    assert not guide.follow(10 ** 10)
+    reference.track_links(here)
+    np.testing.assert_array_equal(reference.angles, here)
+    assert not reference.moving
+    assert not reference.rates.any()
+    assert not reference.motion[1:].any()
+    assert not reference.advance(10 ** 10)

@@ -7,24 +7,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import pi
+from typing import Any
 
-from fourbar_ros.control.branch import Branch, CROSSED, FOLDED, LINKS_ALONE
+from fourbar_ros.control.branch import Branch, CROSSED, FOLDED, UNPAIRED_AXES
 from fourbar_ros.control.computed_torque import (
-    A00,
-    A01,
-    A11,
-    axes_of,
-    BRANCH_A,
-    BRANCH_ANGLE,
-    BRANCH_B,
-    BRANCH_INERTIA,
-    BRANCH_RATE,
-    CONDITION,
+    AXES_FIELDS,
     demanded,
-    HOLD,
+    evaluate_axes,
+    Feedback,
     hold_on_branch,
-    TERMS,
+    MOTION_FIELDS,
 )
+from fourbar_ros.control.records import records
 from fourbar_ros.mechanism import (
     assemble,
     kinetic_energy,
@@ -49,27 +43,35 @@ each_parallelogram = pytest.mark.parametrize('linkage', PARALLELOGRAMS)
 
 @dataclass
 class Axes:
-    """What `axes_of` fills in."""
+    """Result of `evaluate_axes`, see `AXES_FIELDS`."""
 
-    rows: Array
-    errors: Array
-    bias: Array
-    terms: Array
+    record: Any
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.record, name)
 
     @property
     def matrix(self) -> Array:
-        a00, a01, a11 = self.terms[[A00, A01, A11]]
-        return np.array([[a00, a01], [a01, a11]])
+        return np.array([[self.a00, self.a01], [self.a01, self.a11]])
+
+    @property
+    def inertias(self) -> Array:
+        """All of the mass matrix that is known."""
+        return np.array([self.a00, self.a01, self.a11, *self.eta_row])
 
 
 def axes_at(mechanism: Mechanism, angles: Array, rates: Array, parallel: bool,
             reference_angles: Array | None = None, reference_rates: Array = NONE,
-            twins: NDArray[np.int64] = LINKS_ALONE) -> Axes:
-    found = Axes(*(np.full(shape, np.nan) for shape in ((3, 4), (2, 2), 3, TERMS)))
-    axes_of(angles, rates, angles if reference_angles is None else reference_angles,
-            reference_rates, parallel, twins, np.array([mechanism.constants]), found.rows,
-            found.errors, found.bias, found.terms)
-    return found
+            paired_links: NDArray[np.int64] = UNPAIRED_AXES) -> Axes:
+    motion, axes = records(MOTION_FIELDS), records(AXES_FIELDS)
+    motion['angles'], motion['rates'] = angles, rates
+    motion['reference_angles'] = angles if reference_angles is None else reference_angles
+    motion['reference_rates'] = reference_rates
+    motion['paired'], motion['paired_links'] = parallel, paired_links
+    for name in axes.dtype.names or ():
+        axes[name] = np.nan
+    evaluate_axes(motion[0], mechanism.constants, axes[0])
+    return Axes(axes[0])
 
 
 def on_branch(phi_a: float, theta: float) -> Array:
@@ -83,7 +85,8 @@ def check_reduced_form(axes: Axes, form: ReducedForm, seed: int) -> None:
                                err_msg=f'seed {seed}')
     np.testing.assert_allclose(axes.bias[:2], form.bias, atol=1e-12 * scale * 4.0,
                                err_msg=f'seed {seed}')
-    np.testing.assert_allclose(axes.rows[:2], form.wheel_map, atol=1e-13, err_msg=f'seed {seed}')
+    np.testing.assert_allclose(
+        axes.wheel_map[:2], form.wheel_map, atol=1e-13, err_msg=f'seed {seed}')
 
 
 @pytest.fixture
@@ -117,10 +120,11 @@ def test_elsewhere_it_is_the_reduced_form_with_no_third_axis(seed: int, uneven: 
     axes = axes_at(uneven, angles, rates, False, angles + 0.1 * wanted, wanted)
     np.testing.assert_array_equal(axes.matrix, form.mass_matrix)
     np.testing.assert_array_equal(axes.bias, [*form.bias, 0.0])
-    np.testing.assert_array_equal(axes.rows, [*form.wheel_map, NONE])
+    np.testing.assert_array_equal(axes.wheel_map, [*form.wheel_map, NONE])
     np.testing.assert_allclose(axes.errors, [0.1 * wanted[:2], (wanted - rates)[:2]], atol=1e-14)
-    assert not axes.terms[BRANCH_A:CONDITION].any()
-    assert axes.terms[CONDITION] == pytest.approx(np.linalg.cond(form.mass_matrix), rel=1e-12)
+    assert not axes.eta_row.any()
+    assert axes.eta == axes.eta_rate == axes.hold == 0.0
+    assert axes.condition == pytest.approx(np.linalg.cond(form.mass_matrix), rel=1e-12)
 
 
 @pytest.mark.parametrize('theta', [0.0, pi, -pi, 2.0 * pi])
@@ -132,14 +136,14 @@ def test_through_change_points_all_is_finite_and_continuous(
     rates, step = np.array([0.7, -1.3, 0.7, -1.3]), 1e-6
     before, at, after = (axes_at(mechanism, on_branch(0.4, theta + change), rates, True)
                          for change in (-step, 0.0, step))
-    assert all(np.isfinite(values).all() for values in (at.rows, at.bias, at.terms, at.errors))
-    scale = np.abs(at.terms[:BRANCH_ANGLE]).max()
+    assert all(np.isfinite(values).all()
+               for values in (at.wheel_map, at.bias, at.inertias, at.errors))
+    scale = np.abs(at.inertias).max()
     for near in (before, after):
-        np.testing.assert_array_equal(near.rows, at.rows)
-        np.testing.assert_allclose(near.terms[:BRANCH_ANGLE], at.terms[:BRANCH_ANGLE],
-                                   atol=4.0 * scale * step)
+        np.testing.assert_array_equal(near.wheel_map, at.wheel_map)
+        np.testing.assert_allclose(near.inertias, at.inertias, atol=4.0 * scale * step)
         np.testing.assert_allclose(near.bias, at.bias, atol=4.0 * scale * step * 1.3 ** 2)
-        assert near.terms[HOLD] == at.terms[HOLD] == 1.0
+        assert near.hold == at.hold == 1.0
 
 
 @pytest.mark.parametrize('theta', [0.0, pi])
@@ -149,7 +153,7 @@ def test_row_of_eta_is_the_motion_that_the_closure_leaves_free(
 ) -> None:
     """`l_c eta_c = l_a eta_a` and so on: joint 3 stays closed, the pairs stay where they are."""
     angles = on_branch(0.4, theta)
-    rows = axes_at(mechanism, angles, NONE, True).rows
+    rows = axes_at(mechanism, angles, NONE, True).wheel_map
     free = rows[2]
     assert free[2] - free[0] == 1.0
     np.testing.assert_allclose(rows[:2] @ free, 0.0, atol=1e-16)
@@ -166,11 +170,12 @@ def test_inertia_of_the_three_axes_is_that_of_the_links(
     rng = np.random.default_rng(seed)
     angles = on_branch(rng.uniform(-3.0, 3.0), rng.uniform(-0.1, 0.1))
     axes, on_axes = axes_at(mechanism, angles, NONE, True), rng.uniform(-1.0, 1.0, 3)
-    coupling, own = axes.terms[[BRANCH_A, BRANCH_B]], axes.terms[BRANCH_INERTIA]
+    coupling, own = axes.eta_row[:2], axes.eta_row[2]
     matrix = np.block([[axes.matrix, coupling[:, None]], [coupling[None, :], np.array([[own]])]])
     assert 0.5 * on_axes @ matrix @ on_axes == pytest.approx(
-        kinetic_energy(mechanism, angles, axes.rows.T @ on_axes, NONE), rel=1e-12), f'seed {seed}'
-    assert axes.terms[CONDITION] == pytest.approx(np.linalg.cond(axes.matrix), rel=1e-9)
+        kinetic_energy(mechanism, angles, axes.wheel_map.T @ on_axes, NONE),
+        rel=1e-12), f'seed {seed}'
+    assert axes.condition == pytest.approx(np.linalg.cond(axes.matrix), rel=1e-9)
 
 
 @each_seed
@@ -180,21 +185,21 @@ def test_errors_are_those_of_the_pairs_and_eta_is_what_is_left(
 ) -> None:
     rng = np.random.default_rng(seed)
     angles, rates = on_branch(0.3, rng.choice([0.01, pi - 0.01])), rng.uniform(-1.0, 1.0, 4)
-    free = axes_at(mechanism, angles, NONE, True).rows[2]
+    free = axes_at(mechanism, angles, NONE, True).wheel_map[2]
     (pair_a, pair_b, eta), (rate_a, rate_b, eta_rate) = rng.uniform(-0.1, 0.1, (2, 3))
     axes = axes_at(mechanism, angles, rates, True,
                    angles + [pair_a, pair_b, pair_a, pair_b] - eta * free,
                    rates + [rate_a, rate_b, rate_a, rate_b] - eta_rate * free)
     np.testing.assert_allclose(axes.errors, [[pair_a, pair_b], [rate_a, rate_b]], atol=1e-14,
                                err_msg=f'seed {seed}')
-    np.testing.assert_allclose(axes.terms[[BRANCH_ANGLE, BRANCH_RATE]], [eta, eta_rate],
+    np.testing.assert_allclose([axes.eta, axes.eta_rate], [eta, eta_rate],
                                atol=1e-14, err_msg=f'seed {seed}')
 
 
 # Other branches of a rhombus
 
 def on_other(branch: Branch, phi_a: float, theta: float) -> Array:
-    return branch.spread(np.array([phi_a, phi_a + theta]), np.full(2, branch.apart))
+    return branch.to_links(np.array([phi_a, phi_a + theta]), np.full(2, branch.pair_angle))
 
 
 @pytest.mark.parametrize('turn', [0.0, 2.0 * pi])
@@ -207,15 +212,16 @@ def test_row_of_eta_on_other_branches_is_what_the_closure_leaves_free(
     """The twins turn apart, joint 3 stays closed; also with a twin a turn ahead."""
     angles = on_other(branch, 0.4, theta)
     angles[branch.followers[1]] += turn
-    axes = axes_at(mechanism, angles, NONE, True, twins=branch.twins)
-    free = axes.rows[2]
+    axes = axes_at(mechanism, angles, NONE, True, paired_links=branch.paired_links)
+    free = axes.wheel_map[2]
     for axis, (first, second) in enumerate(branch.pairs):
         assert abs(free[second] - free[first]) == 1.0
-        np.testing.assert_array_equal(np.flatnonzero(axes.rows[axis]), sorted((first, second)))
-    np.testing.assert_allclose(axes.rows[:2] @ free, 0.0, atol=1e-16)
+        np.testing.assert_array_equal(
+            np.flatnonzero(axes.wheel_map[axis]), sorted((first, second)))
+    np.testing.assert_allclose(axes.wheel_map[:2] @ free, 0.0, atol=1e-16)
     arms = np.array([-1.0, 1.0, 1.0, -1.0]) * mechanism.link_lengths
     assert abs((arms * free) @ np.exp(1j * angles)) < 1e-16
-    assert axes.terms[HOLD] == pytest.approx(1.0)
+    assert axes.hold == pytest.approx(1.0)
 
 
 @each_seed
@@ -227,9 +233,9 @@ def test_on_the_crossed_branch_it_is_the_reduced_form(
     rng = np.random.default_rng(seed)
     theta = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, pi - 0.3)
     angles = on_other(CROSSED, rng.uniform(-3.0, 3.0), theta)
-    rates = CROSSED.spread(rng.uniform(-2, 2, 2), np.zeros(2))
+    rates = CROSSED.to_links(rng.uniform(-2, 2, 2), np.zeros(2))
     form = reduced_form(mechanism, angles, rates)
-    axes = axes_at(mechanism, angles, rates, True, twins=CROSSED.twins)
+    axes = axes_at(mechanism, angles, rates, True, paired_links=CROSSED.paired_links)
     check_reduced_form(axes, form, seed)
 
 
@@ -243,8 +249,8 @@ def test_folded_and_crossed_branch_are_the_same_for_identical_links(
     phi, theta = rng.uniform(-3.0, 3.0, 2)
     rates = rng.uniform(-2.0, 2.0, 2)
     folded, crossed = (
-        axes_at(mechanism, on_other(branch, phi, theta + branch.apart),
-                branch.spread(rates, np.zeros(2)), True, twins=branch.twins)
+        axes_at(mechanism, on_other(branch, phi, theta + branch.pair_angle),
+                branch.to_links(rates, np.zeros(2)), True, paired_links=branch.paired_links)
         for branch in (FOLDED, CROSSED))
     scale = np.abs(folded.matrix).max()
     np.testing.assert_allclose(crossed.matrix, folded.matrix, atol=1e-14 * scale,
@@ -271,10 +277,10 @@ def test_hold_is_full_at_change_points_and_fades_without_a_corner() -> None:
 def demand_of(axes: Axes, errors: Array, acceleration: Array = NONE[:2], band: float = 0.0,
               sticking: float = 0.0, disturbance: Array = NONE[:2], stiffness: float = 16.0,
               damping: float = 7.2) -> Array:
-    found = np.full(3, np.nan)
-    demanded(acceleration, errors, stiffness, damping, band, disturbance, sticking, axes.bias,
-             axes.terms, found)
-    return found
+    demand = np.full(3, np.nan)
+    demanded(acceleration, Feedback(errors, stiffness, damping, band, sticking, disturbance),
+             axes.record, demand)
+    return demand
 
 
 @pytest.fixture(params=SEEDS)

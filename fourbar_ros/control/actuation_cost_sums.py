@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the wheels hold and what their motors have spent."""
+"""Actuation cost: kinetic energy of the wheels, and sums of work and heat of their motors."""
 
 from __future__ import annotations
 
@@ -13,50 +13,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 ENERGIES = ('flywheel_energy_j', 'eq9_j_s', 'work_j', 'copper_loss_j')
-"""Names of what :attr:`Accounts.energies` holds."""
+"""Names of :attr:`ActuationCostSums.energies`."""
 
 FLYWHEEL_ENERGY, EQ9, WORK, COPPER = range(4)
 
-# A longer silence than this between two ticks does not count as motion [s].
-LONGEST_PERIOD = 0.1
+MAX_PERIOD = 0.1
+"""Longest time between two ticks that counts as motion [s]; a longer one is a gap in the data."""
 
 
-class Accounts:
+class ActuationCostSums:
     """
-    Keeps the accounts of a run.
+    Sums the actuation cost of a run.
 
-    :ivar energies: (4,) kinetic energy of the wheels, paper eq. 7 [J]; cumulative "power" as
-        eq. 9 is printed [J s]; mechanical work of the motors without regard to sign [J]; heat in
-        their windings, 0 where these are not described [J]. The last three are sums.
+    :ivar energies: (4,) kinetic energy of the wheels, paper eq. 7 [J]; paper eq. 9 as printed, the
+        integral of twice the kinetic energy [J s]; mechanical work of the motors, the integral of
+        `|torque x relative speed|` [J]; heat in their windings, 0 where the mechanism file does
+        not describe them [J]. The last three are sums.
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
         self.energies = np.zeros(len(ENERGIES))
         self._motors = np.array([motors_of(mechanism)])
 
-    def begin(self) -> None:
-        """Begin the sums anew."""
+    def reset(self) -> None:
+        """Set the sums to zero."""
         self.energies[:] = 0.0
 
-    def book(self, period: float, link_rates: Array, speeds: Array, efforts: Array) -> None:
+    def add(self, period: float, link_rates: Array, speeds: Array, efforts: Array) -> None:
         """
-        Book a period.
+        Add a period.
 
-        :param period: its length, 0 for none [s].
+        :param period: its length, 0 for no motion [s].
         :param link_rates: (4,) [rad/s].
         :param speeds: (4,) of the wheels, relative to the links [rad/s].
         :param efforts: (4,) of the motors [N m].
         """
-        if period > LONGEST_PERIOD:
+        if period > MAX_PERIOD:
             period = 0.0
-        book(period, link_rates, speeds, efforts, self._motors, self.energies)
+        _add(period, link_rates, speeds, efforts, self._motors, self.energies)
 
 
 @kernel
-def book(period: float, link_rates: Array, speeds: Array, efforts: Array,
-         boxed: NDArray[np.record], energies: Array) -> None:
-    """Book a period, see :meth:`Accounts.book`."""
-    motors = boxed[0]
+def _add(period: float, link_rates: Array, speeds: Array, efforts: Array,
+         packed: NDArray[np.record], energies: Array) -> None:
+    """See :meth:`ActuationCostSums.add`."""
+    motors = packed[0]
     doubled = work = heat = 0.0
     for j in range(4):
         absolute = speeds[j] + link_rates[j]

@@ -1,14 +1,14 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Commands make wheels gain the momentum that is asked for, whatever their bearings take."""
+"""Wheel commands: wheels gain the demanded momentum in spite of bearing friction."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from fourbar_ros.control import ControllerSettings, WheelCommand
-from fourbar_ros.control.wheel_command import by_name, REACH, UNSURE, WheelCommander
+from fourbar_ros.control.wheel_command import by_name, FRICTION_SPEED, SPEED_REACH, WheelCommander
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.mechanism.motors import SPEED_BANDWIDTH
 from fourbar_ros.plant import InitialState, Plant, Table
@@ -46,7 +46,8 @@ def drive_for(plant: Plant, drive: WheelCommander, torques: Array, seconds: floa
         truth = plant.truth()
         # Free links accelerate as the wheels push them; of the last period that is exact enough.
         acceleration, rates = (truth.link_rates - rates) / PERIOD, truth.link_rates
-        drive.look(truth.wheel_speeds, settings)
+        drive.update_friction(
+            truth.wheel_speeds, settings.bearing_coulomb, settings.bearing_viscous)
         command = drive.command(torques, acceleration, truth.wheel_speeds, ALL, PERIOD, by_speed)
         plant.advance(STEPS, command.values, command.by_speed, command.powered)
         commands.append(command)
@@ -62,7 +63,7 @@ def test_commanded_speeds_make_wheels_gain_the_momentum_asked_for(
 ) -> None:
     """From standstill: what the bearings take, the motors' own loop gives besides."""
     plant, drive = plant_with(prototype, bearings), WheelCommander(prototype)
-    drive.begin(np.zeros(4))
+    drive.reset(np.zeros(4))
     drive_for(plant, drive, TORQUES, 2.0, True, ControllerSettings())
     gained = momenta(prototype, plant)
     # It follows a ramp with its speed late by no more than 4 a / bandwidth^2 times the friction
@@ -77,7 +78,7 @@ def test_commanded_torques_have_the_friction_added(prototype: Mechanism) -> None
     for settings, gained_share in ((known, 1.0), (ControllerSettings(), 0.5)):
         plant, drive = plant_with(prototype, bearings), WheelCommander(prototype)
         plant.advance(1000, 2.0 * TORQUES + np.copysign(2e-3, TORQUES))
-        assert np.abs(plant.truth().wheel_speeds).min() > 10.0 * UNSURE
+        assert np.abs(plant.truth().wheel_speeds).min() > 10.0 * FRICTION_SPEED
         # Until the motors give what they are told and no longer what they were.
         drive_for(plant, drive, TORQUES, 0.1, False, settings)
         before = momenta(prototype, plant)
@@ -91,24 +92,25 @@ def test_commanded_torques_have_the_friction_added(prototype: Mechanism) -> None
             assert (gained < 0.7).all()
 
 
-def test_friction_is_known_by_sign_from_a_little_speed_on(prototype: Mechanism) -> None:
+def test_friction_has_the_sign_of_the_speed_above_a_small_speed(prototype: Mechanism) -> None:
     drive = WheelCommander(prototype)
-    settings = ControllerSettings(bearing_coulomb=1e-3, bearing_viscous=2e-6)
-    speeds = np.array([0.0, 0.25 * UNSURE, -UNSURE, 100.0])
+    speeds = np.array([0.0, 0.25 * FRICTION_SPEED, -FRICTION_SPEED, 100.0])
     np.testing.assert_allclose(
-        drive.look(speeds, settings),
-        [0.0, 2.5e-4 + 2e-6 * 0.25 * UNSURE, -1e-3 - 2e-6 * UNSURE, 1e-3 + 2e-4], rtol=1e-12)
+        drive.update_friction(speeds, 1e-3, 2e-6),
+        [0.0, 2.5e-4 + 2e-6 * 0.25 * FRICTION_SPEED, -1e-3 - 2e-6 * FRICTION_SPEED,
+         1e-3 + 2e-4], rtol=1e-12)
     # Dissipative, odd, and without a jump.
     sweep = np.linspace(-2.0, 2.0, 4001)
-    friction = np.array([drive.look(np.full(4, speed), settings)[0] for speed in sweep])
+    friction = np.array([
+        drive.update_friction(np.full(4, speed), 1e-3, 2e-6)[0] for speed in sweep])
     assert (friction * sweep >= 0.0).all()
     np.testing.assert_allclose(friction, -friction[::-1], atol=1e-18)
-    assert np.abs(np.diff(friction)).max() <= (1e-3 / UNSURE + 2e-6) * 1.001e-3
+    assert np.abs(np.diff(friction)).max() <= (1e-3 / FRICTION_SPEED + 2e-6) * 1.001e-3
 
 
 def test_motors_are_not_asked_for_more_than_their_limit(prototype: Mechanism) -> None:
     drive = WheelCommander(prototype)
-    drive.look(np.full(4, 100.0), ControllerSettings(bearing_coulomb=1e-3))
+    drive.update_friction(np.full(4, 100.0), 1e-3, 0.0)
     command = drive.command(np.array([0.05, -0.05, 0.02, 0.0]), NONE, NONE, ALL, PERIOD, False)
     np.testing.assert_allclose(command.values, [0.05, -0.049, 0.021, 0.001])
 
@@ -122,7 +124,7 @@ def test_speeds_start_where_the_wheels_are(speed: float, prototype: Mechanism) -
     plant.advance(200, np.zeros(4))
     before = momenta(prototype, plant)
     truth = plant.truth()
-    drive.begin(truth.wheel_speeds)
+    drive.reset(truth.wheel_speeds)
     command = drive.command(NONE, NONE, truth.wheel_speeds, ALL, PERIOD, True)
     np.testing.assert_array_equal(command.values, truth.wheel_speeds)
     plant.advance(STEPS, command.values, True)
@@ -132,7 +134,7 @@ def test_speeds_start_where_the_wheels_are(speed: float, prototype: Mechanism) -
 def test_change_from_torques_to_speeds_goes_on_from_what_is_measured(prototype: Mechanism
                                                                      ) -> None:
     drive = WheelCommander(prototype)
-    drive.begin(np.full(4, 500.0))
+    drive.reset(np.full(4, 500.0))
     speeds = np.array([10.0, -20.0, 30.0, 0.0])
     drive.command(NONE, NONE, speeds, ALL, PERIOD, False)
     np.testing.assert_array_equal(
@@ -142,12 +144,12 @@ def test_change_from_torques_to_speeds_goes_on_from_what_is_measured(prototype: 
 def test_speeds_run_ahead_no_further_than_the_motor_can_follow(prototype: Mechanism) -> None:
     """A wheel that does not follow is asked for most of its torque, and winds nothing up."""
     drive, speeds = WheelCommander(prototype), np.full(4, 20.0)
-    drive.begin(speeds)
+    drive.reset(speeds)
     for _ in range(1000):
         command = drive.command(TORQUES, NONE, speeds, ALL, PERIOD, True)
     asked = SPEED_BANDWIDTH * prototype.flywheel_inertias * (command.values - speeds)
     np.testing.assert_allclose(
-        asked, REACH * prototype.motor_torque_limits * np.sign(TORQUES), rtol=1e-12)
+        asked, SPEED_REACH * prototype.motor_torque_limits * np.sign(TORQUES), rtol=1e-12)
     back = drive.command(-TORQUES, NONE, speeds, ALL, PERIOD, True)
     assert (np.sign(back.values - command.values) == -np.sign(TORQUES)).all()
 
@@ -155,7 +157,7 @@ def test_speeds_run_ahead_no_further_than_the_motor_can_follow(prototype: Mechan
 def test_links_that_accelerate_take_their_wheels_along(prototype: Mechanism) -> None:
     """A wheel without torque keeps its absolute speed: relative to its link it falls behind."""
     drive, acceleration = WheelCommander(prototype), np.array([1.0, -2.0, 0.5, 0.0])
-    drive.begin(NONE)
+    drive.reset(NONE)
     for _ in range(5):
         command = drive.command(NONE, acceleration, NONE, ALL, PERIOD, True)
     np.testing.assert_allclose(command.values, -5.0 * PERIOD * acceleration, rtol=1e-12)
@@ -165,7 +167,7 @@ def test_links_that_accelerate_take_their_wheels_along(prototype: Mechanism) -> 
 
 def test_wheel_without_power_is_not_named_and_wound_up(prototype: Mechanism) -> None:
     drive, powered = WheelCommander(prototype), np.array([True, False, True, True])
-    drive.begin(NONE)
+    drive.reset(NONE)
     for speed in (10.0, 8.0, 6.0):
         command = drive.command(TORQUES, NONE, np.full(4, speed), powered, PERIOD, True)
     names, velocities, efforts = by_name(command)

@@ -9,8 +9,7 @@ from dataclasses import fields
 
 from fourbar_ros.common.settings import Setting
 from fourbar_ros.control import Controller, ControllerSettings
-from fourbar_ros.control.parameters import PARAMETERS, SETTINGS
-from fourbar_ros.control.settings import WHEEL_TARGETS
+from fourbar_ros.control.settings import PARAMETERS, SETTINGS, WHEEL_TARGETS
 from fourbar_ros.mechanism import Mechanism
 import pytest
 
