@@ -37,8 +37,10 @@ def starts_processes(item: pytest.Item) -> bool:
     return any(item.get_closest_marker(name) for name in ('node', 'package'))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Give one worker all tests that start processes, first, and keep others together by file."""
+    if not config.pluginmanager.hasplugin('xdist'):
+        return
     items.sort(key=starts_processes, reverse=True)
     for item in items:
         group = 'processes' if starts_processes(item) else str(item.path)
