@@ -5,10 +5,12 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import cache
 from importlib.util import module_from_spec, spec_from_file_location
 from itertools import count
 import os
 from pathlib import Path
+import re
 from types import ModuleType
 from typing import Any
 
@@ -37,14 +39,29 @@ def starts_processes(item: pytest.Item) -> bool:
     return any(item.get_closest_marker(name) for name in ('node', 'package'))
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Give one worker all tests that start processes, first, and keep others together by file."""
-    if not config.pluginmanager.hasplugin('xdist'):
-        return
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give one worker all files whose tests start processes, and keep the others together."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ScheduleByFile(LoadScopeScheduling):      # type: ignore[misc]
+        """Scheduling of whole files; those whose tests start processes are one unit."""
+
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.partition('::')[0]
+            return 'processes' if has_processes(file) else file
+    return ScheduleByFile(config, log)
+
+
+@cache
+def has_processes(file: str) -> bool:
+    """Tell whether a file marks tests that start processes."""
+    return re.search(r'mark\.(node|package)\b', Path(file).read_text()) is not None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the tests that start processes first: the other worker computes meanwhile."""
     items.sort(key=starts_processes, reverse=True)
-    for item in items:
-        group = 'processes' if starts_processes(item) else str(item.path)
-        item.add_marker(pytest.mark.xdist_group(group))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

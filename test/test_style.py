@@ -4,6 +4,7 @@
 """What the tree promises about itself: headers, one-way imports, thin nodes, one version."""
 
 import ast
+from graphlib import CycleError, TopologicalSorter
 from importlib.util import resolve_name
 import os
 from pathlib import Path
@@ -99,6 +100,20 @@ def test_rooms_import_one_way(path):
     room = room_of(path)
     rooms = {name.split('.')[1] for name in imports(path) if name.startswith('fourbar_ros.')}
     assert (rooms & set(MAY_IMPORT)) - {room} <= set(MAY_IMPORT[room])
+
+
+def test_imports_have_no_cycles():
+    """File by file, imports inside functions and for type checking included."""
+    names = {path: '.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__')
+             for path in MODULES}
+    modules = set(names.values())
+    graph = {name: {target if target in modules else target.rpartition('.')[0]
+                    for target in imports(path)} & modules - {name}
+             for path, name in names.items()}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(' -> '.join(error.args[1]))
 
 
 def test_every_folder_is_a_known_room():

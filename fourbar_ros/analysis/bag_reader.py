@@ -88,8 +88,8 @@ class BagReader:
             raise self._damaged(error) from error
         if count < expected:
             raise bag_error(self.path, 'damaged',
-                           f' is truncated: it holds {count} of {expected} messages',
-                           value=count, limit=expected)
+                            f' is truncated: it holds {count} of {expected} messages',
+                            value=count, limit=expected)
 
     def deserialize(self, connection: Connection, data: bytes) -> Any:
         """
@@ -104,7 +104,7 @@ class BagReader:
 
     def _damaged(self, error: Exception, place: str = '') -> BagError:
         return bag_error(self.path, 'damaged',
-                        f' is truncated or damaged{place}: {_one_line(error)}')
+                         f' is truncated or damaged{place}: {_one_line(error)}')
 
 
 @contextmanager
@@ -120,13 +120,13 @@ def open_bag(path: Path) -> Iterator[BagReader]:
         check_directory(path)
     elif path.suffix not in STORAGES:
         raise bag_error(path, 'not_a_bag', ' is not a bag: name a rosbag2 directory, or a file '
-                       f'that ends in {" or ".join(STORAGES)}')
+                        f'that ends in {" or ".join(STORAGES)}')
     try:
         reader = Reader(path)
         reader.open()
     except Exception as error:  # a damaged file can break any layer: YAML, SQL, MCAP, zstd
         raise bag_error(path, 'damaged', ' cannot be read, it is truncated, damaged or of an '
-                       f'unknown format: {_one_line(error)}') from error
+                        f'unknown format: {_one_line(error)}') from error
     try:
         yield BagReader(path, reader)
     finally:
@@ -143,14 +143,14 @@ def check_directory(path: Path) -> None:
         raise bag_error(path, 'missing', ': no such directory')
     if not path.is_dir():
         raise bag_error(path, 'not_a_bag',
-                       ' is a file: name the rosbag2 directory that contains it')
+                        ' is a file: name the rosbag2 directory that contains it')
     if (path / 'metadata.yaml').is_file():
         return
     for suffix, storage in STORAGES.items():
         if any(path.glob(f'*{suffix}')):
             repair = f'ros2 bag reindex -s {storage} {path}'
             raise bag_error(path, 'no_metadata', ' has no metadata.yaml, its recorder was killed: '
-                           f'repair it with `{repair}`', repair=repair)
+                            f'repair it with `{repair}`', repair=repair)
     raise bag_error(path, 'not_a_bag', ' is not a rosbag2 directory: it has no metadata.yaml')
 
 

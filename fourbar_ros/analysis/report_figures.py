@@ -184,7 +184,7 @@ def angles(data: ReportData) -> Figure:
 
 
 def _inset(data: ReportData, axes: Axes, link: int, curves: list[tuple[str, JointSeries, Any]],
-             reference: JointSeries) -> None:
+           reference: JointSeries) -> None:
     """Magnify the middle of the step: the curves coincide on the scale of the motion."""
     middle_ns = (data.manoeuvre.start_ns + data.manoeuvre.step_end_ns) // 2
     turn = float(data.manoeuvre.goal[link] - data.manoeuvre.initial[link])
@@ -329,7 +329,7 @@ def _limit_lines(axes: Axes, limits: Floats | None, largest: float, factor: floa
 
 
 def energy(data: ReportData) -> Figure:
-    """Plot flywheel energy (paper eq. 7), paper eq. 9, and the work of the motors."""
+    """Plot the energy of the wheels, eq. 7 and 9 of the paper, and the work of the motors."""
     figure, panels = style.panels(2.7, 1, 3)
     curves: list[tuple[int, str, Nanoseconds, Floats, dict[str, Any]]] = []
     reasons = []

@@ -18,5 +18,5 @@ Record: TypeAlias = Any
 
 
 def records(fields: Fields, count: int = 1) -> NDArray[np.record]:
-    """Return an array of records (count,) with zeros, as kernels take it."""
+    """Return an array of shape (count,) with zeroed records, as kernels take it."""
     return cast(NDArray[np.record], np.zeros(count, np.dtype((np.record, fields))))

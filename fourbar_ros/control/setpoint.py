@@ -157,8 +157,8 @@ def complete(mechanism: Mechanism, goals: dict[int, float], present: Array, last
 
 
 def follow_path(mechanism: Mechanism, move: TrajectorySegment, present: Array, *,
-           crossing: bool = False,
-           branch: Branch | None = None) -> Array:
+                crossing: bool = False,
+                branch: Branch | None = None) -> Array:
     """
     Follow the path of a planned move, and check it.
 

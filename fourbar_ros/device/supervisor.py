@@ -182,7 +182,7 @@ class DeviceSupervisor:
                   or self._stamp_ns - self._sample_ns[name] > self._settings.sensor_timeout * 1e9]
         if silent:
             arming_blockers = [*arming_blockers, f'no sample from {", ".join(silent)} for '
-                                     f'{self._settings.sensor_timeout:g} s']
+                               f'{self._settings.sensor_timeout:g} s']
         arming_blockers = [*arming_blockers, *self.device.arming_blockers()]
         was_armed = self.arming.armed
         armed, message = self.arming.arm(self._stamp_ns, arming_blockers)
@@ -268,7 +268,7 @@ class DeviceSupervisor:
         age_s = (self._tick_ns - stamp_ns) * 1e-9
         if age_s > self._settings.command_timeout:
             raise RejectedError('stale', f'stamp is {age_s:g} s older than the last tick, limit '
-                                        f'{self._settings.command_timeout:g} s')
+                                f'{self._settings.command_timeout:g} s')
         if age_s < 0.0:
             raise RejectedError('stale', f'stamp is {-age_s:g} s ahead of the last tick')
         if self._command_stamp_ns is not None and stamp_ns < self._command_stamp_ns:

@@ -97,7 +97,9 @@ def _restart(hypothesis: BiasHypothesis, without_effect: bool) -> None:
     hypothesis.bias = hypothesis.glr = 0.0
     hypothesis.variance = BIAS_SIGMA * BIAS_SIGMA
     if without_effect:
-        hypothesis.effect[:] = 0.0
+        effect = hypothesis.effect
+        for i in range(MAX_SIZE):
+            effect[i] = 0.0
 
 
 @kernel

@@ -21,7 +21,6 @@ from fourbar_ros.estimation.filter_model import Model
 from fourbar_ros.estimation.filter_state import (
     ANGLES,
     LENGTHS,
-    MOTION,
     RATES,
     SIZE_WITH_LENGTHS,
     TORQUES,
@@ -37,7 +36,6 @@ from fourbar_ros.kernels.linear_algebra import (
     Vector4,
     ZERO,
 )
-from fourbar_ros.kernels.matrices import product
 from fourbar_ros.mechanism.change_points import RIGID_CONSTRAINT_RATIO
 from fourbar_ros.mechanism.constants import Array, Constants
 from fourbar_ros.mechanism.constrained import (
@@ -218,8 +216,9 @@ def add_mass_reduction(x: Array, mobility: Array, model: Model) -> None:
     """Add the mass reduction of compliant joints to the mobility (4, 4), in place."""
     cosines, sines = directions(four(x[ANGLES]))
     weak = _weak_closure(cosines, sines, model)
-    response = np.array(weak.response)
-    mobility += np.outer(weak.mass_reduction * response, response)
+    for i in range(4):
+        for k in range(4):
+            mobility[i, k] += weak.mass_reduction * weak.response[i] * weak.response[k]
 
 
 @kernel
@@ -237,12 +236,27 @@ def linearize_compliant(x: Array, covariance: Array, mobility: Array, duration: 
     cosines, sines = directions(four(x[ANGLES]))
     weak = _weak_closure(cosines, sines, model)
     stiffness, gradient, curvature = weak.stiffness, weak.gradient, weak.curvature
-    generator = _generator(weak, mobility, model)
-    term = generator * duration
-    transition[MOTION, :SIZE_WITH_LENGTHS] = np.eye(8, SIZE_WITH_LENGTHS) + term
+    generator = np.zeros((8, SIZE_WITH_LENGTHS))
+    _fill_generator(weak, mobility, model, generator)
+    term = np.zeros((8, SIZE_WITH_LENGTHS))
+    last = np.zeros((8, SIZE_WITH_LENGTHS))
+    for i in range(8):
+        transition[i, :SIZE_WITH_LENGTHS] = 0.0
+        transition[i, i] = 1.0
+        for k in range(SIZE_WITH_LENGTHS):
+            term[i, k] = generator[i, k] * duration
+            transition[i, k] += term[i, k]
     for n in range(2, TERMS + 1):
-        term = product(generator[:, MOTION] * duration / n, term)
-        transition[MOTION, :SIZE_WITH_LENGTHS] += term
+        last[:], term[:] = term, 0.0
+        for i in range(8):
+            for m in range(8):
+                weight = generator[i, m] * duration / n
+                if weight != 0.0:
+                    for k in range(SIZE_WITH_LENGTHS):
+                        term[i, k] += weight * last[m, k]
+        for i in range(8):
+            for k in range(SIZE_WITH_LENGTHS):
+                transition[i, k] += term[i, k]
     force = stiffness * weak.gap + model.damping * dot(gradient, four(x[RATES]))
     # Correlation time of an error of the force: a radian of the motion.
     correlation = 1.0 / max(sqrt(stiffness * dot(gradient, weak.response)), SLOWEST)
@@ -253,29 +267,47 @@ def linearize_compliant(x: Array, covariance: Array, mobility: Array, duration: 
             variance += stiffness * stiffness * curvature[i] * curvature[k] * bent
     density = variance * correlation * duration
     white = model.opposing_torque * model.opposing_torque * duration
-    response, opposing = np.array(weak.response), mobility[:, :2] - mobility[:, 2:]
-    added = np.outer(density * response, response) + white * product(opposing, opposing.T)
-    noise[ANGLES, ANGLES] += added * duration * duration / 3.0
-    noise[ANGLES, RATES] += added * duration / 2.0
-    noise[RATES, ANGLES] += (added * duration / 2.0).T
-    noise[RATES, RATES] += added
+    angle_angle, angle_rate = noise[ANGLES, ANGLES], noise[ANGLES, RATES]
+    rate_angle, rate_rate = noise[RATES, ANGLES], noise[RATES, RATES]
+    for i in range(4):
+        for k in range(4):
+            added = density * weak.response[i] * weak.response[k] + white * (
+                (mobility[i, 0] - mobility[i, 2]) * (mobility[k, 0] - mobility[k, 2])
+                + (mobility[i, 1] - mobility[i, 3]) * (mobility[k, 1] - mobility[k, 3]))
+            angle_angle[i, k] += added * duration * duration / 3.0
+            angle_rate[i, k] += added * duration / 2.0
+            rate_angle[k, i] += added * duration / 2.0
+            rate_rate[i, k] += added
 
 
 @kernel
-def _generator(weak: WeakClosure, mobility: Array, model: Model) -> Array:
-    """Return the derivative of angles and rates over time by the state."""
-    gradient, curvature = np.array(weak.gradient), np.array(weak.curvature)
-    lengths, share = model.constants.lengths[1:], model.opposite_share
-    force = weak.stiffness * weak.gap
-    # Torques on the links by the state. The gap and its gradient are linear in the lengths.
+def _fill_generator(weak: WeakClosure, mobility: Array, model: Model, generator: Array) -> None:
+    """
+    Evaluate the derivative of angles and rates over time by the state.
+
+    :param generator: (8, SIZE_WITH_LENGTHS) zero, receives it.
+    """
+    gradient, curvature, stiffness = weak.gradient, weak.curvature, weak.stiffness
+    lengths, share = model.constants.lengths, model.opposite_share
+    # Torques on the links by the state.
     torques = np.zeros((4, SIZE_WITH_LENGTHS))
-    torques[:, ANGLES] = (
-        np.outer(-weak.stiffness * gradient, gradient) - np.diag(force * curvature))
-    torques[:, RATES] = np.outer(-model.damping * gradient, gradient)
-    torques[:2, TORQUES], torques[2:, TORQUES] = (1.0 - share) * np.eye(2), share * np.eye(2)
-    torques[:, LENGTHS] = np.outer(gradient, weak.stiffness * curvature[1:]) / lengths
-    torques[1:, LENGTHS] -= np.diag(force * gradient[1:] / lengths)
-    generator = np.zeros((8, SIZE_WITH_LENGTHS))
-    generator[ANGLES, RATES] = np.eye(4)
-    generator[RATES] = product(mobility, torques)
-    return generator
+    by_angles, by_rates = torques[:, ANGLES], torques[:, RATES]
+    by_disturbances, by_lengths = torques[:, TORQUES], torques[:, LENGTHS]
+    for i in range(4):
+        for k in range(4):
+            by_angles[i, k] = -stiffness * gradient[i] * gradient[k]
+            by_rates[i, k] = -model.damping * gradient[i] * gradient[k]
+        by_angles[i, i] -= stiffness * weak.gap * curvature[i]
+        for k in range(1, 4):
+            # The gap and its gradient are linear in the lengths.
+            by_lengths[i, k - 1] = stiffness * curvature[k] * gradient[i] / lengths[k]
+        if i > 0:
+            by_lengths[i, i - 1] -= stiffness * weak.gap * gradient[i] / lengths[i]
+    by_disturbances[0, 0], by_disturbances[2, 0] = 1.0 - share, share
+    by_disturbances[1, 1], by_disturbances[3, 1] = 1.0 - share, share
+    accelerations, rates_by_rates = generator[RATES], generator[ANGLES, RATES]
+    for i in range(4):
+        rates_by_rates[i, i] = 1.0
+        for k in range(SIZE_WITH_LENGTHS):
+            for m in range(4):
+                accelerations[i, k] += mobility[i, m] * torques[m, k]

@@ -178,7 +178,8 @@ def _messages(estimator: Estimator, stamp_ns: int, estimate: Estimate | None
         yield message(ESTIMATE_GYRO_BIAS, map(sensor_name, biases),
                       np.array(list(biases.values())))
     if statuses := estimator.sample_statuses():
-        sensors, codes, nis = np.array(statuses, float).T
+        # Contiguous rows, as serialisers need them.
+        sensors, codes, nis = np.array(statuses, float).T.copy()
         yield message(ESTIMATE_DECISIONS, (sensor_name(int(sensor)) for sensor in sensors), codes,
                       nis, (codes == ACCEPTED).astype(float))
     if (innovation := estimate.innovation) is not None:

@@ -73,27 +73,36 @@ def update(x: Array, covariance: Array, hypotheses: Records, sensors: Records, m
     """
     model = models[0]
     count, size = sensors.size, x.size
-    samples = Samples(
-        sensors, variances, np.empty(count), np.empty(count), np.empty(count, np.int64))
+    innovations, sample_nis = np.empty(count), np.empty(count)
+    statuses = np.empty(count, np.int64)
     cross = np.zeros((count, size))     # H P
     used = 0
     for m in range(count):
-        _innovate(x, covariance, samples, m, measured[m], cross[m])
-        _gate(hypotheses, samples, m, gate)
-        used += samples.statuses[m] == ACCEPTED
+        sensor = sensors[m].sensor
+        innovation, nis = _innovate(
+            x, covariance, sensors[m].row, measured[m], variances[m], sensor >= 0, cross[m])
+        innovations[m], sample_nis[m] = innovation, nis
+        if sensor >= 0 and hypotheses[ONSET, sensor].state == FAULTY:
+            statuses[m] = EXCLUDED
+            check_recovery(hypotheses, sensor, nis)
+        elif nis <= gate:
+            statuses[m] = ACCEPTED
+            used += 1
+        else:
+            statuses[m] = GATED
     s = np.empty((used, used))
     if used == 0:
-        return (s, s, np.zeros((size, 0)), 0.0, samples.innovations, samples.nis,
-                samples.statuses)
+        return s, s, np.zeros((size, 0)), 0.0, innovations, sample_nis, statuses
     h, ph = np.empty((used, size)), np.empty((size, used))
     y, r, accepted = np.empty(used), np.empty(used), np.empty(used, np.int64)
     n = 0
     for m in range(count):
-        if samples.statuses[m] == ACCEPTED:
-            y[n], r[n] = samples.innovations[m], variances[m]
+        if statuses[m] == ACCEPTED:
+            y[n], r[n] = innovations[m], variances[m]
             accepted[n] = sensors[m].sensor
-            h[n] = sensors[m].row[:size]
-            ph[:, n] = cross[m]
+            row = sensors[m].row
+            for i in range(size):
+                h[n, i], ph[i, n] = row[i], cross[m, i]
             n += 1
     for m in range(used):
         for n in range(used):
@@ -117,6 +126,7 @@ def update(x: Array, covariance: Array, hypotheses: Records, sensors: Records, m
     if used == count:
         update_hypotheses(hypotheses, accepted, h, y, inverse, gain)
     else:
+        samples = Samples(sensors, variances, innovations, sample_nis, statuses)
         _update_hypotheses_gated(hypotheses, samples, gate, prior, gain)
     indispensable = np.ones(hypotheses.shape[1], np.bool_)
     for m in range(count):
@@ -126,19 +136,21 @@ def update(x: Array, covariance: Array, hypotheses: Records, sensors: Records, m
     if model.uncertain_lengths:
         set_lengths(x, model)
     enforce_closure(x, covariance, model)
-    return s, inverse, gain, nis, samples.innovations, samples.nis, samples.statuses
+    return s, inverse, gain, nis, innovations, sample_nis, statuses
 
 
 @kernel
-def _innovate(x: Array, covariance: Array, samples: Samples, m: int, measured: float,
-              cross: Array) -> None:
+def _innovate(x: Array, covariance: Array, row: Array, measured: float, variance: float,
+              is_angle: bool, cross: Array) -> tuple[float, float]:
     """
-    Evaluate the innovation of sample m and its NIS.
+    Evaluate the innovation of a sample.
 
+    :param row: of H.
+    :param variance: of the sample.
     :param cross: (n,) zero, receives h P.
+    :returns: innovation and its NIS.
     """
-    size, row = x.size, samples.sensors[m].row
-    predicted, variance = 0.0, samples.variances[m]
+    size, predicted = x.size, 0.0
     for k in range(size):
         share = row[k]
         if share != 0.0:
@@ -148,20 +160,9 @@ def _innovate(x: Array, covariance: Array, samples: Samples, m: int, measured: f
     for i in range(size):
         variance += row[i] * cross[i]
     innovation = measured - predicted
-    if samples.sensors[m].sensor >= 0:
+    if is_angle:
         innovation = pi - (pi - innovation) % (2.0 * pi)
-    samples.innovations[m], samples.nis[m] = innovation, innovation * innovation / variance
-
-
-@kernel
-def _gate(hypotheses: Records, samples: Samples, m: int, gate: float) -> None:
-    """Set the status of sample m."""
-    sensor, nis = samples.sensors[m].sensor, samples.nis[m]
-    if sensor >= 0 and hypotheses[ONSET, sensor].state == FAULTY:
-        samples.statuses[m] = EXCLUDED
-        check_recovery(hypotheses, sensor, nis)
-    else:
-        samples.statuses[m] = ACCEPTED if nis <= gate else GATED
+    return innovation, innovation * innovation / variance
 
 
 @kernel

@@ -42,7 +42,6 @@ from fourbar_ros.estimation.filter_state import (
 )
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.kernels.linear_algebra import combine, dot, solve_lower, solve_upper
-from fourbar_ros.kernels.matrices import product
 from fourbar_ros.kernels.runge_kutta import Drive
 from fourbar_ros.mechanism.change_points import (
     DISTINCT_SIGMAS_SQUARED,
@@ -476,16 +475,30 @@ def _linearize_free(mobility: Array, opposite_share: float, duration: float, mod
     :param mobility: (4, 4) accelerations per torque on each link [1/(kg m^2)].
     :param opposite_share: of the disturbance torques of links a and b that acts on c and d.
     """
-    disturbed = (1.0 - opposite_share) * mobility[:, :2] + opposite_share * mobility[:, 2:]
+    disturbed = np.empty((4, 2))
+    for i in range(4):
+        for k in range(2):
+            disturbed[i, k] = (
+                (1.0 - opposite_share) * mobility[i, k] + opposite_share * mobility[i, 2 + k])
     t = duration
     white, walk = model.torque * model.torque, model.torque_walk * model.torque_walk
-    transition[MOTION, MOTION] = np.eye(8)
-    transition[ANGLES, RATES] = t * np.eye(4)
-    transition[ANGLES, TORQUES] = 0.5 * t * t * disturbed
-    transition[RATES, TORQUES] = t * disturbed
-    _integrate_noise(
-        product(white * mobility, mobility.T), product(walk * disturbed, disturbed.T),
-        walk * disturbed, walk, duration, noise)
+    angle_rate = transition[ANGLES, RATES]
+    angle_torque, rate_torque = transition[ANGLES, TORQUES], transition[RATES, TORQUES]
+    fast, slow, cross = np.zeros((4, 4)), np.zeros((4, 4)), np.empty((4, 2))
+    for i in range(MOTION.stop):
+        transition[i, i] = 1.0
+    for i in range(4):
+        angle_rate[i, i] = t
+        for k in range(2):
+            angle_torque[i, k] = 0.5 * t * t * disturbed[i, k]
+            rate_torque[i, k] = t * disturbed[i, k]
+            cross[i, k] = walk * disturbed[i, k]
+        for k in range(4):
+            for m in range(4):
+                fast[i, k] += white * mobility[i, m] * mobility[k, m]
+            for m in range(2):
+                slow[i, k] += walk * disturbed[i, m] * disturbed[k, m]
+    _integrate_noise(fast, slow, cross, walk, duration, noise)
 
 
 @kernel

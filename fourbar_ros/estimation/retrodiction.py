@@ -45,7 +45,7 @@ INITIAL_RATE_SIGMA = 10.0
 class _Checkpoint(NamedTuple):
     """The filter with a snapshot of it, if there is one, and the counters that a run changes."""
 
-    filter: LinkageFilter | None
+    linkage_filter: LinkageFilter | None
     snapshot: Snapshot | None
     gated_in_a_row: int
     starts: int
@@ -264,7 +264,7 @@ class RetrodictionFilter:
                            self._gated_in_a_row, self.starts)
 
     def _restore(self, checkpoint: _Checkpoint) -> None:
-        self.filter, self.starts = checkpoint.filter, checkpoint.starts
+        self.filter, self.starts = checkpoint.linkage_filter, checkpoint.starts
         self._gated_in_a_row = checkpoint.gated_in_a_row
-        if checkpoint.filter is not None and checkpoint.snapshot is not None:
-            checkpoint.filter.restore(checkpoint.snapshot)
+        if checkpoint.linkage_filter is not None and checkpoint.snapshot is not None:
+            checkpoint.linkage_filter.restore(checkpoint.snapshot)

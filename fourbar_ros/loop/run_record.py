@@ -35,7 +35,7 @@ COLUMNS = (
     ('sigma_rate_', names.ESTIMATE_SIGMA, 'velocity', LINKS),
     ('', names.ESTIMATE_INNOVATION, 'position',
      (*INNOVATION_STATISTICS, *(f'innovation_{kind}{name}' for kind in ('', 'gyro_')
-                  for name in (*LINKS, *JOINT_NAMES)))),
+                                for name in (*LINKS, *JOINT_NAMES)))),
     ('disturbance_', names.ESTIMATE_DISTURBANCE, 'position', ('a', 'b', 'sigma_a', 'sigma_b')),
     ('reference_link_', names.REFERENCE, 'position', LINKS),
     ('reference_rate_', names.REFERENCE, 'velocity', LINKS),

@@ -74,7 +74,7 @@ def conditioning_grid(mechanisms: Sequence[Mechanism], thetas: ArrayLike, branch
     check_branch(branch)
     constants = np.array([mechanism.constants for mechanism in mechanisms])
     columns = _grid(constants, np.ascontiguousarray(thetas, dtype=float),
-                  1.0 if branch == 'open' else -1.0, WHEELS.astype(float))
+                    1.0 if branch == 'open' else -1.0, WHEELS.astype(float))
     return Conditioning(columns[..., 0], columns[..., 1], columns[..., 2], columns[..., 3],
                         columns[..., 4:])
 

@@ -324,7 +324,7 @@ def signed_links(cosines: Vector4, sines: Vector4, lengths: Array) -> tuple[Vect
 
 @kernel
 def factored_inertia(cosines: Vector4, sines: Vector4, rates: Vector4, constants: Constants
-             ) -> tuple[Triangle, Vector4]:
+                     ) -> tuple[Triangle, Vector4]:
     """Factor M into L L^T, and evaluate the bias h."""
     m_ab, m_ac, m_ad, m_bc, m_bd, m_cd, n_ab, n_ac, n_ad, n_bc, n_bd, n_cd = pair_inertias(
         _vectors(cosines, sines, constants), constants)

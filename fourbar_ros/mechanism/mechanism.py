@@ -20,7 +20,7 @@ from fourbar_ros.common.settings import (
     settings_of,
 )
 from fourbar_ros.mechanism.change_points import LENGTH_ROUNDING, MATCHING_LENGTHS
-from fourbar_ros.mechanism.constants import Array, Constants, constants_of
+from fourbar_ros.mechanism.constants import Array, Constants, FIELDS, JOINTS, PAIRS, record
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -166,7 +166,7 @@ class Mechanism(Settings):
 
         :param prescribed: (4,) bool, the wheels with a prescribed angle relative to the link.
         """
-        return constants_of(self, np.asarray(prescribed, dtype=bool))
+        return _constants_of(self, np.asarray(prescribed, dtype=bool))
 
     @classmethod
     def from_mapping(cls, values: Any, place: str = '') -> Mechanism:
@@ -204,3 +204,62 @@ def checked_array(row: Setting, values: ArrayLike, elements: Sequence[str],
     """
     listed = values.tolist() if isinstance(values, np.ndarray) else values
     return np.array(row.check_each(listed, elements, inner=inner), dtype=float)
+
+
+def _constants_of(mechanism: Mechanism, prescribed: Array) -> Constants:
+    """
+    Evaluate the constants of a mechanism.
+
+    :param prescribed: (4,) bool, wheels whose motion relative to their links is prescribed.
+    """
+    masses = mechanism.link_masses
+    lengths = mechanism.link_lengths
+    inertias = mechanism.link_inertias + np.where(prescribed, mechanism.flywheel_inertias, 0.0)
+    # Relative to joint 1; c is attached to b (joint 2), d to a (joint 4).
+    arms = np.zeros((4, 4, 2))
+    arms[range(4), range(4)] = mechanism.com_positions
+    arms[2, 1, 0] = lengths[1]
+    arms[3, 0, 0] = lengths[0]
+    arms -= np.einsum('i,ijx->jx', masses / masses.sum(), arms)
+    x, y = arms[..., 0], arms[..., 1]
+    cosine = np.einsum('i,ij,ik->jk', masses, x, x) + np.einsum('i,ij,ik->jk', masses, y, y)
+    sine = np.einsum('i,ij,ik->jk', masses, y, x) - np.einsum('i,ij,ik->jk', masses, x, y)
+    cosine[range(4), range(4)] += inertias
+    scale = np.array([1.0, 1.0, lengths[2], lengths[3]])
+    pairs = tuple(zip(*PAIRS))
+    compliant = bool(np.isfinite(mechanism.joint_stiffness).all())
+    return record(
+        FIELDS, lengths=lengths, cosine=cosine, sine=sine,
+        pair_cosine=(cosine / np.outer(scale, scale))[pairs],
+        pair_sine=(sine / np.outer(scale, scale))[pairs], own_inertias=np.diag(cosine), arms=arms,
+        masses=masses, inertias=inertias, com_positions=mechanism.com_positions,
+        total_mass=masses.sum(), flywheel_inertias=mechanism.flywheel_inertias,
+        prescribed=prescribed, joint_stiffness=mechanism.joint_stiffness,
+        joint_damping=mechanism.joint_damping, compliant=compliant,
+        fastest_joint_mode=_fastest_joint_mode(mechanism) if compliant else 0.0)
+
+
+def _fastest_joint_mode(mechanism: Mechanism) -> float:
+    """
+    Bound the fastest motion that the springs and dampers of the joints can cause [rad/s].
+
+    By Gershgorin's theorem on the blocks of J M^-1 J^T, two rows for each joint, weighted with
+    the stiffness: the square of a frequency. Likewise with the damping: a decay rate.
+    """
+    radii = np.hypot(
+        mechanism.com_positions[:, :1] - np.column_stack([np.zeros(4), mechanism.link_lengths]),
+        mechanism.com_positions[:, 1:])
+    mobility = np.zeros((4, 4))
+    for row, first in enumerate(JOINTS):
+        for column, second in enumerate(JOINTS):
+            for link, far in first:
+                for other, other_far in second:
+                    if link == other:
+                        mobility[row, column] += (
+                            1.0 / mechanism.link_masses[link]
+                            + radii[link, int(far)] * radii[link, int(other_far)]
+                            / mechanism.link_inertias[link])
+    stiffness, damping = (
+        float((np.sqrt(np.outer(weight, weight)) * mobility).sum(axis=1).max())
+        for weight in (mechanism.joint_stiffness, mechanism.joint_damping))
+    return max(float(np.sqrt(stiffness)), damping)

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 # Joint 1 to 4: the links of the chain from joint 1 to it.
 CHAINS = np.array([[0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0],
-                 [0.0, 1.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0]])
+                   [0.0, 1.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0]])
 
 
 @kernel
@@ -105,7 +105,7 @@ def meet_edges(state: Array, half_x: float, half_y: float, restitution: float,
             if not (abs(place) > half and place * speed > 0.0):
                 continue
             direction = (sign * lever[0, across], sign * lever[1, across],
-                    sign * lever[2, across], sign * lever[3, across])
+                         sign * lever[2, across], sign * lever[3, across])
             gain = rates_of_impulse(angles, direction, constants)
             impulse = -(1.0 + restitution) * speed / (
                 1.0 / constants.total_mass + dot(direction, gain))

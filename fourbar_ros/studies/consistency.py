@@ -70,7 +70,7 @@ def run(progress: Progress, sample: Sample) -> Result:
             else:
                 sums.append(each)
     results = [CaseResult(case, each, bound_of(case.scenario, each))
-                for case, each in zip(chosen, sums)]
+               for case, each in zip(chosen, sums)]
     files: dict[str, str | bytes] = {'consistency.csv': _csv(results)}
     skipped: list[str] = []
     with figures(skipped):

@@ -81,7 +81,7 @@ def _shares(axes: Axes, statistics: dict[str, CrossingStatistics]) -> None:
         axes.annotate(f'{each.passed} of {each.runs}', (place, high), (0.0, 4.0),
                       textcoords='offset points', ha='center', fontsize=8.0)
     axes.set_xticks(range(len(statistics)), [METHODS[method].replace(', ', ',\n')
-                                          for method in statistics])
+                                             for method in statistics])
     axes.set_xlim(-0.6, len(statistics) - 0.4)
     axes.set_ylim(0.0, 115.0)
     axes.set_yticks(range(0, 101, 20))

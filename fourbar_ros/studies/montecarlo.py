@@ -25,11 +25,11 @@ from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.studies import cores, csv_text, figures, Result, Sample, StudyError
 from fourbar_ros.studies.campaigns import CampaignError
 from fourbar_ros.studies.campaigns.campaign import Campaign, load_campaign
+from fourbar_ros.studies.campaigns.campaign_metrics import METRICS
 from fourbar_ros.studies.campaigns.campaign_run import (
     compile_kernels,
     empty_row,
     execute_run,
-    METRICS,
     Row,
     WALL,
 )
@@ -159,7 +159,7 @@ def _result(campaign: Campaign, table: pa.Table, table_with_time: pa.Table) -> R
                 'rate_low': float(rate_low), 'rate_high': float(rate_high),
                 'reasons': {reason: reasons.count(reason) for reason in dict.fromkeys(reasons)}}
     data = {
-        'runs': len(table), 'seed': campaign.seed, 'campaign_hash': campaign.hash,
+        'runs': len(table), 'seed': campaign.seed, 'campaign_hash': campaign.digest,
         'versions': dict(campaign.versions),
         'failures': failures,
         'metrics': {name: {'n': each.n, **{

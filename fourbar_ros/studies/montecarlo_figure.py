@@ -13,7 +13,7 @@ from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plotting import style
 from fourbar_ros.plotting.style import COLOURS, LINK_COLOURS
 from fourbar_ros.studies.campaigns.campaign import Limit
-from fourbar_ros.studies.campaigns.campaign_run import METRICS
+from fourbar_ros.studies.campaigns.campaign_metrics import METRICS
 from fourbar_ros.studies.campaigns.campaign_summary import Correlation, Statistics
 from fourbar_ros.studies.campaigns.distributions import Parameter
 from matplotlib.axes import Axes

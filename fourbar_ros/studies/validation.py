@@ -129,7 +129,7 @@ def checks(comparisons: list[EngineComparison]) -> list[Check]:
         ('test 2, change of configuration', np.diff(turned['paper_test_2'], axis=1)),
         ('opposite commands, turn of any link', turned['paper_opposite']))]
     results.append(at_most('momentum, drift relative to that of the wheels',
-                         max(map(momentum_drift, comparisons)), '', EXACT))
+                           max(map(momentum_drift, comparisons)), '', EXACT))
     results.append(at_most('closure, widest gap', max(
         closure_error(comparison.motion.case.mechanism, angles)
         for comparison in comparisons for angles in comparison.ours.link_angles), 'm', 1e-12))

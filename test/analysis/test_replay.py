@@ -121,7 +121,7 @@ def test_single_file_is_enough(synthetic, loop_messages, same, tmp_path, storage
 
 
 def test_bag_of_an_older_recorder(synthetic, loop_messages, same, tmp_path):
-    """SQLite before Iron: no definitions, no hashes, another metadata version."""
+    """A bag in SQLite before Iron has no definitions, no hashes, and another version."""
     from ruamel.yaml import YAML
     bag = synthetic.write_bag(tmp_path / 'bag', loop_messages, StoragePlugin.SQLITE3, version=8)
     with sqlite3.connect(bag / 'bag.db3') as base:

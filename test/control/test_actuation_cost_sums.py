@@ -81,7 +81,7 @@ def test_sums_grow_for_any_signs_until_reset(prototype: Mechanism) -> None:
     last = cost.energies.copy()
     for _ in range(100):
         cost.add(4e-3, rng.normal(size=4), 50.0 * rng.normal(size=4),
-                      1e-2 * rng.normal(size=4))
+                 1e-2 * rng.normal(size=4))
         assert (cost.energies[[EQ9, WORK, COPPER]] > last[[EQ9, WORK, COPPER]]).all()
         last = cost.energies.copy()
     cost.reset()

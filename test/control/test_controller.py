@@ -545,7 +545,7 @@ def test_answers_are_not_written_anew(moving: Any) -> None:
 # Commands
 
 def test_by_speed_wheels_are_told_speeds_and_links_move_the_same(steer: Drive,
-                                                                prototype: Mechanism) -> None:
+                                                                 prototype: Mechanism) -> None:
     """Motors that follow torques and motors that follow speeds end at the same place."""
     ends = []
     for command in ('effort', 'velocity'):

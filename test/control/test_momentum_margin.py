@@ -30,8 +30,8 @@ NONE = np.zeros(4)
 
 
 def drifting(mechanism: Mechanism, seconds: float, acceleration: Array, start: Array = NONE,
-            planned: Array = NONE, links: Array = NONE, period: float = PERIOD
-            ) -> tuple[MomentumMonitor, Array]:
+             planned: Array = NONE, links: Array = NONE, period: float = PERIOD
+             ) -> tuple[MomentumMonitor, Array]:
     """Let wheels drift at constant accelerations, beside what is planned; return last speeds."""
     monitor = MomentumMonitor(mechanism)
     monitor.reset(start)
@@ -49,7 +49,8 @@ ACCELERATION = np.array([2.0, -1.0, 0.0, 0.5])
 def test_mean_over_the_last_seconds(seconds: float, period: float, prototype: Mechanism) -> None:
     """The same at any rate of the loop, and whatever else was planned meanwhile."""
     monitor, _ = drifting(prototype, seconds, ACCELERATION, NONE + 7.0,
-                       np.array([1e-3, 0.0, -1e-3, 0.0]), np.array([0.1, 0.2, 0.3, 0.4]), period)
+                          np.array([1e-3, 0.0, -1e-3, 0.0]), np.array([0.1, 0.2, 0.3, 0.4]),
+                          period)
     np.testing.assert_allclose(
         monitor.drift, ACCELERATION * (1.0 - exp(-seconds / DRIFT_TIME)), rtol=1e-6, atol=1e-9)
 

@@ -26,7 +26,7 @@ each_seed = pytest.mark.parametrize('seed', SEEDS)
 
 
 def moving_reference(mechanism: Mechanism, angles: Array, travel: Array, duration: float,
-                 seconds: float) -> tuple[ReferenceGenerator, int]:
+                     seconds: float) -> tuple[ReferenceGenerator, int]:
     """Return a reference after some time of a move, and the stamp."""
     reference = ReferenceGenerator(mechanism)
     reference.rest_at(angles)

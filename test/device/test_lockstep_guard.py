@@ -37,7 +37,7 @@ def test_tick_is_sent_again_after_the_timeout_at_intervals_that_grow() -> None:
 
 def test_link_angles_go_out_again_only_if_the_estimator_said_nothing() -> None:
     for estimate, recovery in ((None, Recovery.SEND_ALL), (FIRST - PERIOD, Recovery.SEND_ALL),
-                             (FIRST, Recovery.SEND_TICK)):
+                               (FIRST, Recovery.SEND_TICK)):
         _, guard, start = waiting()
         assert guard.recovery(estimate, start + TIMEOUT + 1) is recovery
 

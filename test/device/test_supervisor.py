@@ -267,7 +267,7 @@ def test_every_change_of_arming_is_sent_to_the_device_once(operate: Operate) -> 
     bed.supervisor.disarm('test')
     bed.arm()
     assert bed.device.states == [DeviceState.ARMED, DeviceState.EMERGENCY_STOP,
-                               DeviceState.DISARMED, DeviceState.ARMED]
+                                 DeviceState.DISARMED, DeviceState.ARMED]
 
 
 def test_reset_releases_what_the_device_holds_by_itself_but_never_while_armed(

@@ -938,7 +938,7 @@ def test_measurements_of_the_future_are_counted(running: Run) -> None:
 @pytest.mark.parametrize(('lag', 'fault'), [(12, 'samples come late'),
                                             (40, 'samples come too late')])
 def test_slow_sensor_is_reported(lag: int, fault: str, paper: Mechanism
-                                                     ) -> None:
+                                 ) -> None:
     """Its samples act at their stamps within the history."""
     run = Run(paper, InitialState(0.3, 1.6, 'open', 0.5, -0.3))
     run.after(250)

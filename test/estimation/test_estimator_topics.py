@@ -59,6 +59,8 @@ def test_messages_carry_the_whole_estimate(topics: EstimatorTopics, paper: Mecha
             2 * TICK_NS, OUTPUTS[topic].names)
         assert len(message.values) == len(OUTPUTS[topic].fields)
         assert all(len(values) == len(message.names) for values in message.values)
+        # Serialisers take their bytes as they are.
+        assert all(values.flags.c_contiguous for values in message.values)
     assert np.array_equal(said['estimate/link_states'].values,
                           [estimate.link_angles, estimate.link_rates,
                            [*estimate.disturbance, 0.0, 0.0]])

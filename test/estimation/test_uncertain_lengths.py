@@ -163,7 +163,7 @@ def test_turning_off_at_a_change_point(seed: int, aligned: float, miss: tuple[fl
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_compliant_joints_with_a_rigid_model(seed: int, rigid: Mechanism,
-                                                           compliant: Mechanism) -> None:
+                                             compliant: Mechanism) -> None:
     """The force of the joints is uncertain: errors are larger, but no sensor is faulty."""
     world = World(missing(compliant, 1e-4, 0.0, 0.0, 0.0), -0.4, 0.2)
     estimator = Estimator(rigid, SETTINGS)
@@ -368,7 +368,7 @@ def test_exact_lengths_are_not_estimated(rigid: Mechanism, compliant: Mechanism)
                                 ProcessNoise(1e-5, 1e-5))
         for _ in range(50):
             linkage.update((0, 1, 2, 3), linkage.angles + NOISE * rng.standard_normal(4),
-                            NOISE ** 2)
+                           NOISE ** 2)
             linkage.predict(PERIOD, 1e-3 * rng.standard_normal(4))
         np.testing.assert_array_equal(linkage.lengths, rigid.link_lengths)
         ends.append(np.concatenate([linkage.x, linkage.P.ravel()]).tobytes())

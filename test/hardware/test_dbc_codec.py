@@ -157,7 +157,7 @@ def test_heartbeat(link, sequence, state, faults, voltage, temperature, boot):
     report = Heartbeat(link, sequence, state, faults, voltage, temperature, boot)
     back = read(written(report))
     for decoded, encoded, half_count in ((back.voltage, voltage, 0.005),
-                                   (back.temperature, temperature, 0.05)):
+                                         (back.temperature, temperature, 0.05)):
         assert (decoded is None) == (encoded is None)
         assert encoded is None or decoded == pytest.approx(encoded, abs=half_count + 1e-9)
     assert replace(back, voltage=voltage, temperature=temperature) == report

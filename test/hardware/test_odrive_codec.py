@@ -106,7 +106,7 @@ def test_command_after_any_other(link, value, by_speed, enable):
 def test_link_numbers_received_commands():
     host, link = make(), make()
     commands = [command for _ in range(200)
-             for command in received(host, link, Command(1, 0.01, False, True, 9))]
+                for command in received(host, link, Command(1, 0.01, False, True, 9))]
     assert all((after.sequence - before.sequence) % 256 == 1
                for before, after in zip(commands, commands[1:]))
 

@@ -196,8 +196,8 @@ def test_samples_sit_on_the_nearest_count(counts: int, turns: int) -> None:
 
 @hypothesis.settings(deadline=None, max_examples=300, derandomize=True)
 @hypothesis.given(angle=st.floats(-1e4, 1e4) | st.integers(-9, 9).map(lambda n: n * pi)
-       | st.integers(-9, 9).map(lambda n: float(np.nextafter(n * pi, 0.0))),
-       counts=st.sampled_from([0, 0, 1, 2, 7, 26, 1000, 16384]))
+                  | st.integers(-9, 9).map(lambda n: float(np.nextafter(n * pi, 0.0))),
+                  counts=st.sampled_from([0, 0, 1, 2, 7, 26, 1000, 16384]))
 @hypothesis.example(pi, 26)
 def test_samples_lie_in_one_turn(angle: float, counts: int) -> None:
     """13 / 26 of a turn, worked out like any other count, is more than pi."""

@@ -114,7 +114,7 @@ class Bench:
             return list(self.truth[-1].effort) == pytest.approx(TORQUES, rel=0.01)
         self.probe.wait(done)
 
-    def set(self, name, value):
+    def set_parameter(self, name, value):
         """Set a parameter of the emulator: whether it was accepted, and the reason."""
         result, = self.probe.call(
             SetParameters, 'prototype_emulator/set_parameters',
@@ -124,7 +124,7 @@ class Bench:
     def trouble(self, target, kind):
         """Make trouble, and return the system times between which it began [ns]."""
         before_ns = time.time_ns()
-        assert self.set(f'trouble.{target}', kind) == (True, '')
+        assert self.set_parameter(f'trouble.{target}', kind) == (True, '')
         return before_ns, time.time_ns()
 
     def last_driven_ns(self):
@@ -155,7 +155,7 @@ def bench(shared):
     """Return the shared one, and mend it afterwards."""
     yield shared
     for name in TROUBLES:
-        shared.set(name, '')
+        shared.set_parameter(name, '')
     shared.probe.drive(NOTHING)
     shared.probe.newest('flywheel_states')
     shared.probe.trigger('reset_emergency_stop')
@@ -387,7 +387,7 @@ def test_link_that_is_too_hot_ends_it_and_tells_how_hot(bench):
 # The emulator
 
 def test_trouble_that_there_is_not_is_refused_with_a_list(bench):
-    accepted, reason = bench.set('trouble.link_a', 'nonsense')
+    accepted, reason = bench.set_parameter('trouble.link_a', 'nonsense')
     assert not accepted
     assert reason == (f'fault of link_a must be one of {", ".join(INJECTABLE_LINK_FAULTS)}, '
                       "got 'nonsense'")

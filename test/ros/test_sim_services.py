@@ -88,7 +88,7 @@ def quiet(testbed):
     last = stamps(testbed.received['flywheel_states'])[-1]
     # As long as the watchdog, which is many periods.
     testbed.diagnostics(f'{testbed.node.get_namespace()[1:]}/plant',
-                      lambda status: 'paused' in status.message)
+                        lambda status: 'paused' in status.message)
     testbed.diagnostics(f'{testbed.node.get_namespace()[1:]}/plant')
     testbed.catch_up()
     assert stamps(testbed.received['flywheel_states'])[-1] == last

@@ -150,7 +150,7 @@ def test_kanes_method_comes_to_the_same_numbers(fitted) -> None:
     for each in fitted:
         for test in (0, 1):
             difference = (angles(defective(each.sizes), test, each.amplitude)
-                     - angles(PAPER, test, each.amplitude))
+                          - angles(PAPER, test, each.amplitude))
             found = float(np.degrees(np.sqrt((difference ** 2).mean())))
             assert found == pytest.approx(RMS[test], abs=1e-7)
 

@@ -43,7 +43,7 @@ def outcome(passed: bool) -> CrossingOutcome:
     theta = np.linspace(0.5, -0.5, 20)
     eta = 1e-3 * np.cos(theta) if passed else 4.0 * theta
     return CrossingOutcome(passed, 2e-3 if passed else inf, float(np.abs(eta).max()), 0.01,
-                   '' if passed else 'elsewhere', np.column_stack([theta, eta]))
+                           '' if passed else 'elsewhere', np.column_stack([theta, eta]))
 
 
 # Confidence intervals
@@ -319,4 +319,5 @@ def test_default_is_as_many_runs_as_the_limit_needs() -> None:
     study = load_study('crossing')
     assert isinstance(study, partial)
     assert study.keywords['sample'].runs == 300
-    assert load_study('crossing', runs=2).keywords['sample'].runs == 2  # type: ignore[attr-defined]
+    study: Any = load_study('crossing', runs=2)
+    assert study.keywords['sample'].runs == 2

@@ -95,7 +95,7 @@ def test_work_is_what_the_energy_gains_where_no_motor_brakes() -> None:
 
 def test_nothing_is_below_the_least_and_balancing_reaches_it() -> None:
     for cost in (turn(PAPER, WHOLE, 'two_wheels'), turn(UNEQUAL, WHOLE, 'min_norm'),
-                     turn(PAPER, WHOLE, 'min_norm', np.array([50.0, 20.0, -10.0, 0.0]))):
+                 turn(PAPER, WHOLE, 'min_norm', np.array([50.0, 20.0, -10.0, 0.0]))):
         assert (cost.energy >= cost.least_energy * (1.0 - 1e-12)).all()
     unequal = turn(UNEQUAL, WHOLE, 'min_energy')
     np.testing.assert_allclose(unequal.energy, unequal.least_energy, atol=1e-18)

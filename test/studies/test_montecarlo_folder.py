@@ -129,6 +129,7 @@ def test_finished_campaign_is_not_run_again_and_takes_more_runs(
     shown: list[tuple[int, int]] = []
 
     class Bar:
+
         def __init__(self, items: Any, total: int) -> None:
             self.items, self.total, self.initial, self.n = items, total, 0, 0
 
@@ -182,7 +183,7 @@ def test_folder_in_which_nothing_was_finished_belongs_to_no_campaign(
         assert (place / 'campaign.json').exists()
     assert not list(place.iterdir())
     (place / 'parts').mkdir()
-    (place / 'campaign.json').write_text(json.dumps({'hash': first.hash, **first.identity}))
+    (place / 'campaign.json').write_text(json.dumps({'hash': first.digest, **first.identity}))
     with ResultFolder(place, other) as folder:
         folder.add([execute_run(other, 0)])
     with refuses(CampaignError, path=place, different=['seed']):

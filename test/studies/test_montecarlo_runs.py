@@ -15,7 +15,8 @@ from fourbar_ros.cli.main import main
 from fourbar_ros.loop import load_scenario, record_run
 from fourbar_ros.studies import montecarlo
 from fourbar_ros.studies.campaigns.campaign import campaign_from, Limit, load_campaign
-from fourbar_ros.studies.campaigns.campaign_run import execute_run, measure, METRICS, WALL
+from fourbar_ros.studies.campaigns.campaign_metrics import METRICS
+from fourbar_ros.studies.campaigns.campaign_run import execute_run, measure, WALL
 from fourbar_ros.studies.campaigns.campaign_summary import checks_of, correlations, statistics
 import numpy as np
 from PIL import Image

@@ -147,7 +147,7 @@ def test_error_of_euler_is_half_a_step(path: Path) -> None:
 
 @each_case
 def test_default_closure_is_compliant(path: Path) -> None:
-    """MuJoCo's defaults close the loop in 20 ms: good for 1e-4 rad and not for 1e-8 rad."""
+    """The defaults of MuJoCo close the loop in 20 ms: good for 1e-4 rad, not for 1e-8 rad."""
     reference = Reference(path)
     soft = reference.error(reference.move(Settings('RK4', STEP), 4.0))
     hard = reference.error(reference.move(stiff('RK4', STEP), 4.0))

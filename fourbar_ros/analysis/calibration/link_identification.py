@@ -152,8 +152,8 @@ class LinkEstimate:
         errors = np.sqrt(np.einsum('i...,ij,j...->...', slopes, self.covariance, slopes))
         return [
             ParameterEstimate(f'A_{entry} at {np.degrees(pose[1] - pose[0]):.0f} deg', 'kg m^2',
-                     float(values[row, column]), float(errors[row, column]),
-                     float(before[row, column]))
+                              float(values[row, column]), float(errors[row, column]),
+                              float(before[row, column]))
             for row, pose in enumerate(self.poses)
             for column, entry in enumerate(('aa', 'ab', 'bb'))]
 
@@ -248,7 +248,7 @@ class _Fit:
         values = link_parameters(self._mechanism) + self._prior_sigmas * scaled[:_COUNT]
         losses = self._loss_sigmas * scaled[_COUNT:_COUNT + len(LOSS_NAMES)]
         return ModelParameters(with_parameters(self._mechanism, values),
-                       Losses(**dict(zip(LOSS_NAMES, losses.tolist()))), initial)
+                               Losses(**dict(zip(LOSS_NAMES, losses.tolist()))), initial)
 
     def _residuals(self, iterate: _Iterate, simulated: Sequence[Sequence[Floats]]) -> list[Floats]:
         """Return measured minus simulated angles of each window, concatenated over the links."""

@@ -23,7 +23,7 @@ from fourbar_ros.loop.description import describe, load_description
 from fourbar_ros.loop.run import make_loop
 from fourbar_ros.loop.scenario import Scenario, scenario_from
 from fourbar_ros.studies.campaigns import CampaignError
-from fourbar_ros.studies.campaigns.campaign_run import METRICS
+from fourbar_ros.studies.campaigns.campaign_metrics import METRICS
 from fourbar_ros.studies.campaigns.distributions import combine, Distribution, Parameter
 from fourbar_ros.studies.campaigns.parameter_names import (
     elements,
@@ -107,7 +107,7 @@ class Campaign:
     @property
     def columns(self) -> dict[str, type]:
         """Names and types of the columns of drawn values."""
-        return {name: parameter.type for parameter in self.parameters
+        return {name: parameter.value_type for parameter in self.parameters
                 for name in parameter.columns}
 
     @property
@@ -126,7 +126,7 @@ class Campaign:
         return identity
 
     @property
-    def hash(self) -> str:
+    def digest(self) -> str:
         """SHA-256 of the identity."""
         return hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()
 

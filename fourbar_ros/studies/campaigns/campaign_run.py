@@ -1,12 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-A run of a campaign: a closed loop, reduced to a row of metrics.
-
-`METRICS` defines them. They are those of `analysis.metrics`, but over all setpoints of the script
-instead of one.
-"""
+"""A run of a campaign: a closed loop, reduced to a row of the metrics of `campaign_metrics`."""
 
 from __future__ import annotations
 
@@ -14,7 +9,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from math import nan
 import time
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any
 
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.control.actuation_cost_sums import COPPER, EQ9, WORK
@@ -24,12 +19,11 @@ from fourbar_ros.mechanism import LINK_NAMES
 from fourbar_ros.mechanism.angles import wrap_angles
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.studies.campaigns import CampaignError
+from fourbar_ros.studies.campaigns.campaign import Campaign
+from fourbar_ros.studies.campaigns.campaign_metrics import METRICS
 from fourbar_ros.studies.campaigns.versions import difference, versions
 from fourbar_ros.studies.estimator_statistics import normalised_squares
 import numpy as np
-
-if TYPE_CHECKING:
-    from fourbar_ros.studies.campaigns.campaign import Campaign
 
 # Number, seed, drawn values, metrics and failure of a run, by column.
 Row = dict[str, Any]
@@ -39,39 +33,6 @@ FINAL_WINDOW = 1.0
 # Column of the duration of the computation, the only one that differs between repetitions.
 WALL = 'wall_s'
 
-
-class MetricDescription(NamedTuple):
-    """Unit and definition of a metric."""
-
-    unit: str
-    definition: str
-
-
-# Every metric by the name of its column.
-METRICS = {
-    'tracking_rms_rad': MetricDescription(
-        'rad', 'true minus reference angles of links a and b since the first setpoint, rms'),
-    'tracking_peak_rad': MetricDescription('rad', 'largest absolute value of the same'),
-    'final_error_rad': MetricDescription(
-        'rad', 'true angle minus goal of the last setpoint, mean over the last second, of the '
-        'link with the largest; empty if the motion is not over by then'),
-    'estimate_rms_rad': MetricDescription(
-        'rad', 'estimated minus true angles of four links since the first setpoint, rms'),
-    'estimate_peak_rad': MetricDescription('rad', 'largest absolute value of the same'),
-    'nees_per_degree_of_freedom': MetricDescription(
-        '', 'normalised estimation error squared of angles and rates of links a and b, mean over '
-        '4; 1 for a consistent estimator'),
-    'nis_per_degree_of_freedom': MetricDescription('', 'normalised innovation squared, likewise'),
-    'peak_wheel_speed_rad_s': MetricDescription(
-        'rad/s', 'largest speed of a wheel relative to its link'),
-    'peak_torque_n_m': MetricDescription(
-        'N m', 'largest torque of a motor, mean over a control period'),
-    'work_j': MetricDescription(
-        'J', 'absolute mechanical work of the motors since the first setpoint'),
-    'copper_loss_j': MetricDescription('J', 'heat in the windings, likewise'),
-    'eq9_j_s': MetricDescription('J s', 'actuation cost of paper eq. 9, likewise'),
-    'speed_margin': MetricDescription('', 'smallest unused share of the speed limit of a wheel'),
-}
 
 _COSTS = {'work_j': WORK, 'copper_loss_j': COPPER, 'eq9_j_s': EQ9}
 

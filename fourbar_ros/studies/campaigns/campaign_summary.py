@@ -12,7 +12,7 @@ from math import nan, sqrt
 from fourbar_ros.common.checks import at_least, at_most, Check
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.studies.campaigns.campaign import FAILURE_RATE, Limit
-from fourbar_ros.studies.campaigns.campaign_run import METRICS
+from fourbar_ros.studies.campaigns.campaign_metrics import METRICS
 import numpy as np
 from scipy import stats
 

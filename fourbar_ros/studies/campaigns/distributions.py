@@ -198,7 +198,7 @@ class Parameter:
                      for place in self.places)
 
     @property
-    def type(self) -> type:
+    def value_type(self) -> type:
         """Type of the columns: float, bool or str; lists are JSON in text."""
         if self.distribution.kind not in ('choice', 'grid'):
             return float
@@ -223,9 +223,9 @@ class Parameter:
 
     def column_value(self, value: Any) -> Any:
         """Return a drawn value in the type of the column."""
-        if self.type is float:
+        if self.value_type is float:
             return float(value)
-        return value if self.type is bool or isinstance(value, str) else json.dumps(value)
+        return value if self.value_type is bool or isinstance(value, str) else json.dumps(value)
 
 
 def combine(nominal: Any, drawn: Any, how: str) -> Any:

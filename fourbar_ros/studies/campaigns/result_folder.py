@@ -24,7 +24,8 @@ from typing import Any
 from fourbar_ros.common.output_files import write_files
 from fourbar_ros.studies.campaigns import CampaignError
 from fourbar_ros.studies.campaigns.campaign import Campaign
-from fourbar_ros.studies.campaigns.campaign_run import METRICS, Row, WALL
+from fourbar_ros.studies.campaigns.campaign_metrics import METRICS
+from fourbar_ros.studies.campaigns.campaign_run import Row, WALL
 import numpy as np
 import pyarrow as pa
 from pyarrow import parquet
@@ -127,7 +128,7 @@ class ResultFolder:
         ours = self.campaign.identity
         if self._empty():
             # An identity without rows may be of an earlier campaign that finished no run.
-            text = json.dumps({'hash': self.campaign.hash, **ours}, indent=2)
+            text = json.dumps({'hash': self.campaign.digest, **ours}, indent=2)
             write_files({path: f'{text}\n'})
             return
         if not path.exists():
@@ -140,7 +141,7 @@ class ResultFolder:
         except ValueError:
             raise CampaignError(f'{path} is damaged: choose another --output',
                                 path=path) from None
-        if theirs.pop('hash', None) != self.campaign.hash:
+        if theirs.pop('hash', None) != self.campaign.digest:
             different = list(_different_keys('', theirs, ours))
             raise CampaignError(
                 f'{self.path} holds runs of another campaign (different: '

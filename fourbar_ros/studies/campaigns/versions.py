@@ -17,7 +17,8 @@ import fourbar_ros
 # Rooms that a closed loop without ROS consists of.
 ROOMS = ('common', 'control', 'device', 'estimation', 'kernels', 'loop', 'mechanism', 'plant')
 # Modules that draw its parameters and compute its metrics.
-MODULES = ('studies/campaigns/campaign.py', 'studies/campaigns/campaign_run.py',
+MODULES = ('studies/campaigns/campaign.py', 'studies/campaigns/campaign_metrics.py',
+           'studies/campaigns/campaign_run.py',
            'studies/campaigns/distributions.py', 'studies/campaigns/parameter_names.py',
            'studies/estimator_statistics.py')
 LIBRARIES = ('numpy', 'scipy', 'numba', 'filterpy')

@@ -39,7 +39,7 @@ HINGES_OF_ANGLES = np.linalg.inv(ANGLES_OF_HINGES)
 
 # Stages of MuJoCo's step without effect in this model, see `Settings.lean`.
 UNUSED = ('contact', 'island', 'warmstart', 'gravity', 'actuation', 'sensor', 'limit',
-            'frictionloss', 'spring', 'damper')
+          'frictionloss', 'spring', 'damper')
 
 # Tolerance of times as multiples of the step [steps].
 _ROUNDING = 1e-6

@@ -88,7 +88,7 @@ def test_model_that_misses_something_widens_the_intervals(
 def cut(wheels: WheelMeasurements, keep: Any) -> WheelMeasurements:
     """Return the ticks that an index picks."""
     return WheelMeasurements(wheels.times[keep], wheels.angles[keep], wheels.speeds[keep],
-                       wheels.efforts[keep])
+                             wheels.efforts[keep])
 
 
 def test_missing_part_of_the_motion_is_named(
