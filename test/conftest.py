@@ -34,11 +34,6 @@ NICE = 10
 """Niceness of computing tests: a tenth of a processor that a node wants as well."""
 
 
-def starts_processes(item: pytest.Item) -> bool:
-    """Tell whether a test starts nodes or builds the package."""
-    return any(item.get_closest_marker(name) for name in ('node', 'package'))
-
-
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Give one worker all files whose tests start processes, and keep the others together."""
@@ -49,7 +44,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
         def _split_scope(self, nodeid: str) -> str:
             file = nodeid.partition('::')[0]
-            return 'processes' if has_processes(file) else file
+            return 'processes' if has_processes(str(config.rootpath / file)) else file
     return ScheduleByFile(config, log)
 
 
@@ -61,13 +56,13 @@ def has_processes(file: str) -> bool:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the tests that start processes first: the other worker computes meanwhile."""
-    items.sort(key=starts_processes, reverse=True)
+    items.sort(key=lambda item: has_processes(str(item.path)), reverse=True)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Lower the priority of a worker that only computes below the real-time nodes of the other."""
-    if 'PYTEST_XDIST_WORKER' in os.environ and not starts_processes(item) and os.nice(0) == 0:
-        os.nice(NICE)
+    if 'PYTEST_XDIST_WORKER' in os.environ and not has_processes(str(item.path)):
+        os.nice(NICE - os.nice(0))
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -369,9 +369,10 @@ def timing(data: ReportData) -> Figure:
     """Plot the round trip over time and its distribution, with the control period."""
     series = data.series(names.TIMING)
     trips = series.select(('round_trip_s',)).position[:, 0] * 1e3
-    known = np.isfinite(trips)
+    # In lock-step no simulated time passes between a tick and its answer: all round trips are 0.
+    known = trips > 0.0
     if not known.any():
-        raise BagError('no tick was answered')
+        raise BagError('no tick was answered, or the clock was in lock-step')
     period = float(np.median(np.diff(series.stamp_ns))) * 1e-6 if len(series) > 1 else np.nan
     figure, (over_time, distribution) = style.panels(3.0, 1, 2, sharey=True, width_ratios=(3, 1))
     time, trip = style.thin_out(data.seconds(series.stamp_ns), trips, 1200)

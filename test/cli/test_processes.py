@@ -96,7 +96,7 @@ def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
     """Let the stand-in be started in place of the package; clean up whatever happens."""
     stage = Stage(tmp_path)
     monkeypatch.setattr(processes.sys, 'executable', str(stage.child))
-    monkeypatch.setattr(processes, 'PATIENCE', 0.3)
+    monkeypatch.setattr(processes, 'SIGNAL_TIMEOUT_S', 0.3)
     yield stage
     for _, _, pid in stage.lines():
         if alive(pid):
