@@ -226,7 +226,7 @@ def test_disable_takes_the_wheels_from_the_controller_until_enable(armed, fourba
     assert fourbar('disable') == (0, 'not enabled: the wheels get no torque\n', '')
     armed.status('controller_status', mode='idle')
     assert list(armed.more('flywheel_command')[0].effort) == [0.0] * 4
-    assert fourbar('hold') == (1, '', 'the controller is not enabled\n')
+    assert fourbar('hold') == (1, '', 'the controller is not enabled: enable it first\n')
     assert fourbar('enable') == (0, 'enabled\n', '')
     armed.status('controller_status', mode='hold')
     armed.status('device_status', state='armed')
@@ -234,7 +234,7 @@ def test_disable_takes_the_wheels_from_the_controller_until_enable(armed, fourba
 
 @pytest.mark.parametrize('name', ['hold', 'damp'])
 def test_what_only_an_armed_device_can_do_is_refused(testbed, fourbar, name):
-    assert fourbar(name) == (1, '', 'the device is not armed\n')
+    assert fourbar(name) == (1, '', 'the device is not armed: arm it first\n')
 
 
 def test_setpoint_in_degrees_is_accepted(armed, fourbar):
@@ -253,7 +253,8 @@ def test_setpoint_that_the_controller_refuses_exits_with_1(armed, fourbar):
 
 
 def test_setpoint_while_disarmed_is_refused(testbed, fourbar):
-    assert fourbar('setpoint', 'link_a=0.1') == (1, '', 'refused: the device is not armed\n')
+    assert fourbar('setpoint', 'link_a=0.1') == (
+        1, '', 'refused: the device is not armed: arm it first\n')
 
 
 def test_setpoint_that_cannot_be_read_never_reaches_ros(fourbar):

@@ -28,18 +28,8 @@ import sys
 from _pytest.pathlib import import_path, ImportMode
 import pytest
 
-ABSENT = {absent!r}
-
-
-class Absent:
-    """Makes the packages unavailable that package.xml does not list."""
-
-    def find_spec(self, name, path=None, target=None):
-        if name.partition('.')[0] in ABSENT:
-            raise ModuleNotFoundError(f'No module named {{name!r}}', name=name)
-
-
-sys.meta_path.insert(0, Absent())
+# None makes an import fail and importlib.util.find_spec return None.
+sys.modules.update(dict.fromkeys({absent!r}))
 
 
 def pytest_pycollect_makemodule(module_path, parent):
@@ -60,7 +50,8 @@ ABSENT = ('cma', 'dask', 'distributed', 'mujoco', 'pyarrow', 'sympy')
 def plugin(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Write the plugin, and return an environment in which pytest loads it."""
     folder = tmp_path_factory.mktemp('plugin')
-    (folder / 'launch_hook.py').write_text(PLUGIN.format(absent=ABSENT))
+    (folder / 'launch_hook.py').write_text(PLUGIN.format(absent=()))
+    (folder / 'launch_hook_on_ros.py').write_text(PLUGIN.format(absent=ABSENT))
     return {**os.environ, 'PYTHONPATH': str(folder), 'PYTEST_PLUGINS': 'launch_hook'}
 
 
@@ -79,11 +70,19 @@ def run_pytest(*arguments: str, environment: dict[str, str] | None = None
 
 
 def test_collection_is_complete_beside_the_plugin(plugin: dict[str, str]) -> None:
-    """Every file is collected without the packages that a ROS installation lacks."""
+    """Every test is collected."""
     alone = run_pytest('--collect-only')
     beside = run_pytest('--collect-only', environment=plugin)
     assert alone.returncode == beside.returncode == 0, beside.stdout[-2000:] + beside.stderr
     assert counted(beside.stdout, 'collected') == counted(alone.stdout, 'collected') > 5000
+
+
+def test_collection_needs_no_package_that_ros_lacks(plugin: dict[str, str]) -> None:
+    """Without the optional packages only the tests of campaigns are left out."""
+    result = run_pytest('--collect-only',
+                        environment={**plugin, 'PYTEST_PLUGINS': 'launch_hook_on_ros'})
+    assert result.returncode == 0, result.stdout[-2000:] + result.stderr
+    assert counted(result.stdout, 'collected') > 5000
 
 
 def test_tests_run_beside_the_plugin(plugin: dict[str, str]) -> None:

@@ -4,6 +4,7 @@
 """Short campaigns, for the tests of this folder."""
 
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 import signal
 import time
@@ -11,6 +12,10 @@ from typing import Any
 
 import pytest
 import yaml
+
+collect_ignore = ([] if all(map(find_spec, ('distributed', 'loky', 'pyarrow'))) else [
+    'test_montecarlo_cluster.py', 'test_montecarlo_folder.py', 'test_montecarlo_runs.py'])
+"""Tests of campaigns need packages that a ROS installation does not bring."""
 
 TIMEOUT = 300.0
 """Longest wait for an event in another process [s]; the machine may be busy."""
