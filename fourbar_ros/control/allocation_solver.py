@@ -63,9 +63,6 @@ ROUNDING = 1e-12
 DEPENDENT = 1e-9
 """Free wheels are linearly dependent when their independent part is below this share."""
 
-MISSED = 1e-9
-"""Largest share of demand and torques by which balancing may miss the demand: rounding."""
-
 WITHIN = 1e-10
 """Excess of a bound, as a share of the norm of all torques, that counts as rounding error."""
 
@@ -152,37 +149,14 @@ def allocate(rule: Record, wheel_map: Array, demand: Array, motors: MotorState,
         if _excess(x, low, high) > slack:
             scale = min(largest_scale(problem, MARGIN), 1.0)
             goal *= scale
-        exact = x.copy()
         if rule.kind == MIN_MAX_SPEED:
-            if scale < 1.0:
-                _solve_within(problem, slack * scale, exact)
             _tighten(problem, rule, motors.speeds, scale, x)
         if scale < 1.0 or _excess(x, low, high) > slack:
             _solve_within(problem, slack * scale, x)
-        if rule.kind == MIN_MAX_SPEED and _differs(wheel_map, demand, roots * x, roots * exact):
-            x[:] = exact
     for wheel in range(4):
         torques_out[wheel] = min(
             max(roots[wheel] * x[wheel], motors.lower[wheel]), motors.upper[wheel])
     return scale
-
-
-@kernel
-def _differs(wheel_map: Array, demand: Array, torques: Array, exact: Array) -> bool:
-    """
-    Tell whether balanced torques miss the demand that the least norm within the bounds meets.
-
-    Wheels of very unequal weights make the tightened problem ill-conditioned; the demand comes
-    before the wheel speeds.
-
-    :param torques, exact: (4,) of `MIN_MAX_SPEED` and of `CONSTRAINED` [N m].
-    """
-    largest = max(np.abs(torques).max(), np.abs(exact).max())
-    limit = MISSED * (sqrt(_square(demand)) + largest)
-    for row in range(demand.size):
-        if abs(_dot(wheel_map[row], torques - exact)) > limit:
-            return True
-    return False
 
 
 @kernel
