@@ -153,7 +153,7 @@ def test_child_gets_its_name_arguments_environment_and_own_group(stage: Stage) -
 
 
 @pytest.mark.parametrize(('name', 'code', 'words'), [
-    ('brief', 3, 'the last word'), ('mute', 4, 'it said nothing')])
+    ('brief', 3, 'the last word'), ('mute', 4, 'no output')])
 def test_end_of_a_child_is_an_error_with_its_last_words(
     name: str, code: int, words: str, stage: Stage,
 ) -> None:
