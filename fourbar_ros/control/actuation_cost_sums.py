@@ -12,13 +12,13 @@ from fourbar_ros.mechanism.motors import motors_of
 import numpy as np
 from numpy.typing import NDArray
 
+# Names of :attr:`ActuationCostSums.energies`.
 ENERGIES = ('flywheel_energy_j', 'eq9_j_s', 'work_j', 'copper_loss_j')
-"""Names of :attr:`ActuationCostSums.energies`."""
 
 FLYWHEEL_ENERGY, EQ9, WORK, COPPER = range(4)
 
+# Longest time between two ticks that counts as motion [s]; a longer one is a gap in the data.
 MAX_PERIOD = 0.1
-"""Longest time between two ticks that counts as motion [s]; a longer one is a gap in the data."""
 
 
 class ActuationCostSums:

@@ -30,25 +30,21 @@ from fourbar_ros.mechanism.constants import Array, record
 import numpy as np
 from numpy.typing import NDArray
 
+# Names of the rules: values of the parameter `allocation`.
 ALLOCATIONS = ('two_wheels', 'min_norm', 'min_energy', 'bounded', 'min_max_speed')
-"""Names of the rules: values of the parameter `allocation`."""
 
+# Time for which `min_max_speed` extrapolates the wheel speeds [s].
+#
+# Torques in the null space are proportional to its inverse. The rounding of a 14-bit encoder at
+# 250 Hz, 0.1 rad/s, makes 0.3 % of the torque limit of the prototype of it. A manoeuvre of seconds
+# is still followed closely.
 SPEED_HORIZON = 0.1
-"""
-Time for which `min_max_speed` extrapolates the wheel speeds [s].
 
-Torques in the null space are proportional to its inverse. The rounding of a 14-bit encoder at
-250 Hz, 0.1 rad/s, makes 0.3 % of the torque limit of the prototype of it. A manoeuvre of seconds
-is still followed closely.
-"""
-
+# Share of the torque limit that a plan grants `min_max_speed` for balancing wheel speeds.
+#
+# The law balances with the torque that is left over, so balancing never makes a manoeuvre
+# infeasible.
 PLANNED_BALANCING = 0.5
-"""
-Share of the torque limit that a plan grants `min_max_speed` for balancing wheel speeds.
-
-The law balances with the torque that is left over, so balancing never makes a manoeuvre
-infeasible.
-"""
 
 
 class AllocationError(FourbarError):

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 PROPORTIONAL, CONSTRAINED, MIN_MAX_SPEED = range(3)
 
+# Fields of the record that describes a rule to the kernels.
 RULE_FIELDS: Fields = [
     ('kind', np.int64, ()),             # PROPORTIONAL, CONSTRAINED or MIN_MAX_SPEED
     ('weights_inv', float, (4,)),       # v, 0 for a wheel that must not be used
@@ -34,37 +35,32 @@ RULE_FIELDS: Fields = [
     ('horizon', float, ()),             # s, time for which the torques are assumed to be held
     ('soft_limits', float, (4,)),       # N m, exceeded only as far as the least norm exceeds them
 ]
-"""Fields of the record that describes a rule to the kernels."""
 
+# Singular values of the wheel map between which a demand fades out.
+#
+# They are relative to a wheel of the largest inverse weight on its own axis. A demand is met in full
+# from WEAK on, where torques are up to ten times the demand, and not at all up to LOST. They are
+# not relative to the largest singular value, which grows without limit near a change point while the
+# other direction stays as good as ever.
 WEAK = 0.1
 LOST = 0.05
-"""
-Singular values of the wheel map between which a demand fades out.
 
-They are relative to a wheel of the largest inverse weight on its own axis. A demand is met in full
-from WEAK on, where torques are up to ten times the demand, and not at all up to LOST. They are
-not relative to the largest singular value, which grows without limit near a change point while the
-other direction stays as good as ever.
-"""
-
+# Wheels with less leverage on a bound than this share of the strongest wheel are ignored.
+#
+# Otherwise length errors of 1e-6 saturate opposite wheels against each other.
 MARGIN = 0.01
-"""
-Wheels with less leverage on a bound than this share of the strongest wheel are ignored.
 
-Otherwise length errors of 1e-6 saturate opposite wheels against each other.
-"""
-
+# Inverse weights below this share of the largest count as 0: the wheel is not used.
 NEGLIGIBLE = 1e-12
-"""Inverse weights below this share of the largest count as 0: the wheel is not used."""
 
+# Quantities below this share of their neighbours are rounding errors.
 ROUNDING = 1e-12
-"""Quantities below this share of their neighbours are rounding errors."""
 
+# Free wheels are linearly dependent when their independent part is below this share.
 DEPENDENT = 1e-9
-"""Free wheels are linearly dependent when their independent part is below this share."""
 
+# Excess of a bound, as a share of the norm of all torques, that counts as rounding error.
 WITHIN = 1e-10
-"""Excess of a bound, as a share of the norm of all torques, that counts as rounding error."""
 
 
 class MotorState(NamedTuple):
@@ -117,20 +113,21 @@ def allocate(rule: Record, wheel_map: Array, demand: Array, motors: MotorState,
     :returns: the scale, from 0 to 1. It is below 1 where the bounds do not admit the demand; 0
         where no wheel can push an axis any further that way.
     """
-    directions, effectiveness, gains, roots = principal_axes(wheel_map, rule.weights_inv)
-    goal = np.zeros(3)
-    rank = 0
-    strongest = max(gains[0], gains[1], gains[2])
-    for k in range(demand.size):
-        share = _controllability(gains[k], gains)
-        # A null motion of the wheels must not disturb a direction that they cannot drive.
-        disturbed = rule.kind == MIN_MAX_SPEED and gains[k] > ROUNDING * strongest
-        if share > 0.0 or disturbed:
-            for n in range(demand.size):
-                goal[rank] -= share * directions[k, n] * demand[n]
-            effectiveness[rank], gains[rank] = effectiveness[k], gains[k]
-            rank += 1
+    directions, effects, sizes, roots = principal_axes(wheel_map, rule.weights_inv)
+    goal, effectiveness, gains = np.zeros(3), np.zeros((3, 4)), np.zeros(3)
     x, low, high = np.zeros(4), np.zeros(4), np.zeros(4)
+    strongest = max(sizes[0], sizes[1], sizes[2])
+    count = rank = 0
+    for lost in (False, True):
+        for k in range(demand.size):
+            share = _controllability(sizes[k], sizes)
+            if lost == (share <= 0.0) and sizes[k] > ROUNDING * strongest:
+                for n in range(demand.size):
+                    goal[count] -= share * directions[k, n] * demand[n]
+                effectiveness[count], gains[count] = effects[k], sizes[k]
+                count += 1
+        if not lost:
+            rank = count
     for wheel in range(4):
         if roots[wheel] > 0.0:
             low[wheel] = motors.lower[wheel] / roots[wheel]
@@ -146,12 +143,16 @@ def allocate(rule: Record, wheel_map: Array, demand: Array, motors: MotorState,
                 scale = min(scale, bound / x[wheel])
         x *= scale
     else:
-        if _excess(x, low, high) > slack:
+        exceeded = _excess(x, low, high) > slack
+        if exceeded:
             scale = min(largest_scale(problem, MARGIN), 1.0)
             goal *= scale
         if rule.kind == MIN_MAX_SPEED:
-            _tighten(problem, rule, motors.speeds, scale, x)
-        if scale < 1.0 or _excess(x, low, high) > slack:
+            # A null motion of the wheels must not disturb a direction that they cannot drive.
+            undisturbed = Problem(effectiveness, gains, goal, count, low.copy(), high.copy(), roots)
+            _balance(undisturbed, rule, motors.speeds, scale, x)
+            _correct(problem, slack * scale, x)
+        elif exceeded:
             _solve_within(problem, slack * scale, x)
     for wheel in range(4):
         torques_out[wheel] = min(
@@ -399,16 +400,17 @@ def largest_scale(problem: Problem, margin: float) -> float:
 
 
 @kernel
-def _tighten(problem: Problem, rule: Record, speeds: Array, scale: float, x: Array) -> None:
+def _balance(problem: Problem, rule: Record, speeds: Array, scale: float, x: Array) -> None:
     """
-    Tighten the bounds in place to the smallest cap on the wheel speeds, see `MinMaxSpeed`.
+    Solve within the smallest cap on the wheel speeds, see `MinMaxSpeed`, and tighten the bounds.
 
     :param scale: of the goal; the least norm is scaled by it.
-    :param x: (4,) least norm for the unscaled goal, scaled in place.
+    :param x: (4,) least norm for the unscaled goal, receives the balanced torques.
     """
     low, high, roots = problem.low, problem.high, problem.roots
     stiffness = np.zeros(4)
     x *= scale
+    slack = WITHIN * sqrt(_square(x))
     for wheel in range(4):
         if roots[wheel] > 0.0:
             stiffness[wheel] = rule.inertias[wheel] / (rule.horizon * roots[wheel])
@@ -421,6 +423,33 @@ def _tighten(problem: Problem, rule: Record, speeds: Array, scale: float, x: Arr
             rounding = ROUNDING * (cap + abs(speeds[wheel]))
             low[wheel] = max(low[wheel], stiffness[wheel] * (-cap - speeds[wheel] - rounding))
             high[wheel] = min(high[wheel], stiffness[wheel] * (cap - speeds[wheel] + rounding))
+    if scale < 1.0 or _excess(x, low, high) > slack:
+        _solve_within(problem, slack, x)
+
+
+@kernel
+def _correct(problem: Problem, slack: float, x: Array) -> None:
+    """
+    Move x in place by the least norm to where it meets the goal within the bounds.
+
+    The speed cap makes a problem whose only solution is a corner, and wheels of very unequal
+    weights make it ill-conditioned. The demand comes before the wheel speeds.
+
+    :param slack: distance from the goal that counts as rounding error.
+    """
+    goal, low, high = problem.goal.copy(), np.empty(4), np.empty(4)
+    for wheel in range(4):
+        x[wheel] = min(max(x[wheel], problem.low[wheel]), problem.high[wheel])
+        low[wheel], high[wheel] = problem.low[wheel] - x[wheel], problem.high[wheel] - x[wheel]
+    largest = 0.0
+    for k in range(problem.rank):
+        goal[k] -= _dot(problem.effectiveness[k], x)
+        largest = max(largest, abs(goal[k]) / problem.gains[k])
+    if largest > max(slack, ROUNDING * sqrt(_square(x))):
+        move = np.zeros(4)
+        _solve_within(Problem(problem.effectiveness, problem.gains, goal, problem.rank, low, high,
+                              problem.roots), WITHIN * largest, move)
+        x += move
 
 
 @kernel

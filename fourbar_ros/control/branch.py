@@ -102,11 +102,11 @@ PARALLELOGRAM = Branch('parallelogram', ((0, 2), (1, 3)), 0.0)
 FOLDED = Branch('folded', ((0, 1), (2, 3)), 0.0)
 CROSSED = Branch('crossed', ((0, 3), (1, 2)), pi)
 
+# All branches; where two meet, the first is assumed.
 BRANCHES = (PARALLELOGRAM, FOLDED, CROSSED)
-"""All branches; where two meet, the first is assumed."""
 
+# Stands for `paired_links` where links do not turn in pairs: links a and b are the axes.
 UNPAIRED_AXES: NDArray[np.int64] = PARALLELOGRAM.paired_links
-"""Stands for `paired_links` where links do not turn in pairs: links a and b are the axes."""
 
 
 def opposite_links_equal(mechanism: Mechanism) -> bool:

@@ -25,9 +25,10 @@ from fourbar_ros.mechanism.dynamics import mass_matrix, reduced_terms_at
 import numpy as np
 from numpy.typing import NDArray
 
+# Index of the third axis.
 ETA = 2
-"""Index of the third axis."""
 
+# Fields of the record of the links and their reference; without pairs P1, Q1 are a, b.
 MOTION_FIELDS: Fields = [
     ('angles', float, (4,)),                    # rad, of the links, estimated
     ('rates', float, (4,)),                     # rad/s
@@ -36,8 +37,8 @@ MOTION_FIELDS: Fields = [
     ('paired', np.int64, ()),                   # 1 where links turn in pairs, else 0
     ('paired_links', np.int64, (4,)),           # P1, Q1, P2, Q2 of the pairs P and Q
 ]
-"""Fields of the record of the links and their reference; without pairs P1, Q1 are a, b."""
 
+# Fields of the record of the axes.
 AXES_FIELDS: Fields = [
     ('wheel_map', float, (3, 4)),               # G, and the row of eta where links turn in pairs
     ('errors', float, (2, 2)),                  # rad, rad/s: reference minus estimate
@@ -51,7 +52,6 @@ AXES_FIELDS: Fields = [
     ('hold', float, ()),                        # share of the branch hold, 0 to 1
     ('condition', float, ()),                   # cond(A)
 ]
-"""Fields of the record of the axes."""
 
 
 class Feedback(NamedTuple):

@@ -35,36 +35,32 @@ from fourbar_ros.mechanism.closure import branch_of
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
+# Modes: the device is not armed; disabled or unstable gains; bring all rates to zero; hold the
+# reference at rest; follow a move.
 MODES = ('disarmed', 'idle', 'damp', 'hold', 'track')
-"""
-Modes: the device is not armed; disabled or unstable gains; bring all rates to zero; hold the
-reference at rest; follow a move.
-"""
 
+# Modes in which the wheels get no torque.
 UNDRIVEN = ('disarmed', 'idle')
-"""Modes in which the wheels get no torque."""
 
+# Largest difference of a setpoint's stamp from the last tick [s]; the stamp 0 means now.
 SETPOINT_TIMEOUT = 1.0
-"""Largest difference of a setpoint's stamp from the last tick [s]; the stamp 0 means now."""
 
+# Time constants with which joints are taken for sticking at rest, and for sliding in motion [s].
+#
+# Tracking errors decay before the first; compensation must be there soon after a start.
 STICKING_TIME, SLIDING_TIME = 0.3, 0.05
-"""
-Time constants with which joints are taken for sticking at rest, and for sliding in motion [s].
 
-Tracking errors decay before the first; compensation must be there soon after a start.
-"""
-
+# Relative change of the period for which gains are checked again: far above jitter.
 PERIOD_TOLERANCE = 0.05
-"""Relative change of the period for which gains are checked again: far above jitter."""
 
+# Consecutive periods of several ticks that count as a slower loop, and not as lost ticks.
 SLOWER_TICKS = 10
-"""Consecutive periods of several ticks that count as a slower loop, and not as lost ticks."""
 
+# Share of the allocator's torque that a plan may use; the rest is for tracking errors.
 PLANNED_SHARE = 0.9
-"""Share of the allocator's torque that a plan may use; the rest is for tracking errors."""
 
+# Longest time for which a plan extrapolates the drift of wheel speeds [s].
 DRIFT_HORIZON = 60.0
-"""Longest time for which a plan extrapolates the drift of wheel speeds [s]."""
 
 ALL = np.ones(4, dtype=bool)
 

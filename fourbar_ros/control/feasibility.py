@@ -30,25 +30,25 @@ from fourbar_ros.mechanism.dynamics import reduced_terms_at
 import numpy as np
 from numpy.typing import NDArray
 
+# Share of the motor limits that a plan may use; the rest is for feedback.
 SHARE = 0.95
-"""Share of the motor limits that a plan may use; the rest is for feedback."""
 
+# Smallest number of instants at which a path is evaluated; odd, to include its middle.
 SAMPLES = 201
-"""Smallest number of instants at which a path is evaluated; odd, to include its middle."""
 
+# Share of the largest demand that usable wheels may leave unmet: far above rounding errors.
 UNMET = 1e-6
-"""Share of the largest demand that usable wheels may leave unmet: far above rounding errors."""
 
+# Share of a limit that is far above rounding errors and far below what can be measured.
 ROUNDING = 1e-9
-"""Share of a limit that is far above rounding errors and far below what can be measured."""
 
+# Range in which the shortest duration is searched [s], that of `setpoint_duration`.
 LEAST_DURATION = 0.1
 LONGEST_DURATION = 3600.0
-"""Range in which the shortest duration is searched [s], that of `setpoint_duration`."""
 
+# Ratio of two durations of the scan, and relative resolution of the bisection after it.
 SCAN_RATIO = 1.25
 RESOLUTION = 1e-3
-"""Ratio of two durations of the scan, and relative resolution of the bisection after it."""
 
 
 @dataclass(frozen=True, eq=False)

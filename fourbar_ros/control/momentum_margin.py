@@ -18,21 +18,19 @@ from fourbar_ros.mechanism import FLYWHEEL_NAMES, Mechanism
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
+# Time constant of the mean drift of wheel speeds [s].
+#
+# It averages the noise of encoders and the lag of motors; nothing is predicted before it has passed.
 DRIFT_TIME = 5.0
-"""
-Time constant of the mean drift of wheel speeds [s].
 
-It averages the noise of encoders and the lag of motors; nothing is predicted before it has passed.
-"""
-
+# Share of a speed limit below which the margin causes a warning: room for a short manoeuvre.
 MIN_MARGIN = 0.15
-"""Share of a speed limit below which the margin causes a warning: room for a short manoeuvre."""
 
+# Predicted time to saturation below which there is a warning [s]: time for an operator to act.
 MIN_TIME_LEFT = 30.0
-"""Predicted time to saturation below which there is a warning [s]: time for an operator to act."""
 
+# Drift below this share of the speed limit per second is ignored [1/s].
 MIN_DRIFT = 1e-4
-"""Drift below this share of the speed limit per second is ignored [1/s]."""
 
 
 class MomentumMonitor:

@@ -17,11 +17,11 @@ from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
+# Targets of the wheel speeds, see :func:`target_speeds`.
 TARGETS = ('balanced', 'zero', 'bias')
-"""Targets of the wheel speeds, see :func:`target_speeds`."""
 
+# Signs of the target `bias`: opposite within a pair, so that it needs no momentum.
 BIAS_SIGNS = np.array([1.0, 1.0, -1.0, -1.0])
-"""Signs of the target `bias`: opposite within a pair, so that it needs no momentum."""
 
 
 class TargetError(FourbarError):

@@ -10,11 +10,11 @@ from typing import Any, cast, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+# Name, type and shape of each field; eight bytes per number keep records aligned.
 Fields: TypeAlias = list[tuple[str, type, tuple[int, ...]]]
-"""Name, type and shape of each field; eight bytes per number keep records aligned."""
 
+# An element of :func:`records` inside a kernel.
 Record: TypeAlias = Any
-"""An element of :func:`records` inside a kernel."""
 
 
 def records(fields: Fields, count: int = 1) -> NDArray[np.record]:

@@ -13,11 +13,11 @@ from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix
 import numpy as np
 
+# Time in which an aborted move comes to rest [s]; less near a change point.
 STOPPING_TIME = 1.0
-"""Time in which an aborted move comes to rest [s]; less near a change point."""
 
+# Distance of a stop, in rate times time: the quintic that comes to rest without overshoot.
 STOPPING_DISTANCE = 0.5
-"""Distance of a stop, in rate times time: the quintic that comes to rest without overshoot."""
 
 
 class ReferenceGenerator:

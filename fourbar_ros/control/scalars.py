@@ -16,23 +16,19 @@ import numpy as np
 
 LINKS = tuple('abcd')
 
+# Names of :func:`allocation_scalars`: share of the demand that the motors can meet; cond(A); share
+# of the branch hold; whether each motor is at a bound; fault state of each wheel, as index of
+# `wheel_fault_detection.FAULT_STATES`; and the part of each wheel speed in the null space.
 ALLOCATION = (
     'scale', 'condition_number', 'branch_hold', *(f'saturated_{link}' for link in LINKS),
     *(f'verdict_{link}' for link in LINKS), *(f'null_speed_{link}_rad_s' for link in LINKS))
-"""
-Names of :func:`allocation_scalars`: share of the demand that the motors can meet; cond(A); share
-of the branch hold; whether each motor is at a bound; fault state of each wheel, as index of
-`wheel_fault_detection.FAULT_STATES`; and the part of each wheel speed in the null space.
-"""
 
+# Names of :func:`momentum_scalars`: angular momentum of the whole linkage and of the axes; the
+# least share of a speed limit that is left; and the time until drift brings a wheel to its limit.
 MOMENTUM = ('total_n_m_s', 'axis_a_n_m_s', 'axis_b_n_m_s', 'margin', 'time_left_s')
-"""
-Names of :func:`momentum_scalars`: angular momentum of the whole linkage and of the axes; the
-least share of a speed limit that is left; and the time until drift brings a wheel to its limit.
-"""
 
+# A torque within this share of the range between its bounds counts as at its bound.
 AT_BOUND = 1e-6
-"""A torque within this share of the range between its bounds counts as at its bound."""
 
 
 def allocation_scalars(controller: Controller) -> Array:

@@ -25,26 +25,26 @@ from fourbar_ros.mechanism.closure import assemble_along, assemblies
 from fourbar_ros.mechanism.constants import Array
 import numpy as np
 
+# Smallest number of instants at which a path is checked.
 CHECKED_INSTANTS = 200
-"""Smallest number of instants at which a path is checked."""
 
+# Largest turn of a link between two instants [rad]: that of a soft step by half a turn.
 LARGEST_TURN = 0.03
-"""Largest turn of a link between two instants [rad]: that of a soft step by half a turn."""
 
+# Largest number of instants that are checked; a motion that needs more is a mistake.
 MAX_INSTANTS = 40_000
-"""Largest number of instants that are checked; a motion that needs more is a mistake."""
 
+# Difference of angles or of |sin| that is far above rounding errors and far below noise.
 ROUNDING = 1e-9
-"""Difference of angles or of |sin| that is far above rounding errors and far below noise."""
 
+# Largest deviation of further named links from the closure [rad].
 AGREEMENT = 1e-3
-"""Largest deviation of further named links from the closure [rad]."""
 
+# Further turns that are considered; no further turn comes first among equal travels.
 TURNS = (0, 1, -1)
-"""Further turns that are considered; no further turn comes first among equal travels."""
 
+# Link that holds when only one link is named: one that is not parallel to it.
 PARTNER = {0: 1, 1: 0, 2: 1, 3: 0}
-"""Link that holds when only one link is named: one that is not parallel to it."""
 
 
 class SetpointError(FourbarError):

@@ -11,17 +11,17 @@ from fourbar_ros.common.settings import Setting, setting, Settings, settings_of
 from fourbar_ros.control.allocation import ALLOCATIONS
 from fourbar_ros.control.null_space import TARGETS
 
+# Kinds of wheel command: motor torque or wheel speed.
 COMMANDS = ('effort', 'velocity')
-"""Kinds of wheel command: motor torque or wheel speed."""
 
+# Targets of the null-space control of the wheel speeds; `free` applies none.
 WHEEL_TARGETS = ('free', *TARGETS)
-"""Targets of the null-space control of the wheel speeds; `free` applies none."""
 
+# Duration of a setpoint's move: `setpoint_duration`, or the shortest that the wheels allow.
 TIMINGS = ('duration', 'shortest')
-"""Duration of a setpoint's move: `setpoint_duration`, or the shortest that the wheels allow."""
 
+# Treatment of moves that meet a change point.
 CHANGE_POINTS = ('avoid', 'keep', 'choose')
-"""Treatment of moves that meet a change point."""
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,11 @@ class ControllerSettings(Settings):
                                       'change points', low=0.0, high=20.0, live=True)
 
 
+# Declarations of the fields of `ControllerSettings`.
 SETTINGS = settings_of(ControllerSettings)
-"""Declarations of the fields of `ControllerSettings`."""
 
+# All parameters of the node.
 PARAMETERS = (
     Setting('mechanism', 'paper', '', 'preset or path of a mechanism file'),
     *SETTINGS,
 )
-"""All parameters of the node."""

@@ -21,8 +21,8 @@ from fourbar_ros.mechanism.motors import SPEED_BANDWIDTH
 import numpy as np
 from scipy.linalg import expm
 
+# Smallest decay rate of errors, as a share of that of the ideal loop: a margin of stability.
 MIN_DECAY = 0.2
-"""Smallest decay rate of errors, as a share of that of the ideal loop: a margin of stability."""
 
 
 class GainError(FourbarError):

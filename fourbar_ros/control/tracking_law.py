@@ -27,23 +27,20 @@ from fourbar_ros.mechanism.motors import available_torque, Motors, motors_of
 import numpy as np
 from numpy.typing import NDArray
 
+# Names of the axes by link: a and b, or the first link of each pair.
 AXES = ('a', 'b', 'c', 'd')
-"""Names of the axes by link: a and b, or the first link of each pair."""
 
+# Share of the motor limit that is available to the allocator, by kind of command.
+#
+# The speed loop in the motor's electronics needs a reserve: at the limit its integral is reset.
 MOTOR_SHARE = {'effort': 0.98, 'velocity': 0.85}
-"""
-Share of the motor limit that is available to the allocator, by kind of command.
 
-The speed loop in the motor's electronics needs a reserve: at the limit its integral is reset.
-"""
-
+# Shortest time in which a held torque may bring a wheel to its speed limit [s].
+#
+# It is far above the control period and the motor lag, so that the limit is not overrun.
 HORIZON = 0.1
-"""
-Shortest time in which a held torque may bring a wheel to its speed limit [s].
 
-It is far above the control period and the motor lag, so that the limit is not overrun.
-"""
-
+# Fields of the record of the inputs of a tick.
 INPUT_FIELDS: Fields = [
     *MOTION_FIELDS,
     ('reference_accelerations', float, (4,)),   # rad/s^2, only those of the axes count
@@ -53,8 +50,8 @@ INPUT_FIELDS: Fields = [
     ('target_speeds', float, (4,)),             # rad/s, absolute, of the null-space control
     ('sticking', float, ()),                    # 0 in motion to 1 at rest, see Feedback
 ]
-"""Fields of the record of the inputs of a tick."""
 
+# Fields of the record of the gains.
 GAIN_FIELDS: Fields = [
     ('stiffness', float, ()),                   # 1/s^2
     ('damping', float, ()),                     # 1/s
@@ -66,8 +63,8 @@ GAIN_FIELDS: Fields = [
     ('motor_share', float, ()),                 # see MOTOR_SHARE
     ('null_weights_inv', float, (4,)),          # inverse weights of the null-space control
 ]
-"""Fields of the record of the gains."""
 
+# Fields of the record of the outputs.
 OUTPUT_FIELDS: Fields = [
     ('torques', float, (4,)),                   # N m, on wheels and links, bearings apart
     ('planned', float, (4,)),                   # N m, part of the reference acceleration alone
@@ -75,7 +72,6 @@ OUTPUT_FIELDS: Fields = [
     ('upper', float, (4,)),
     ('scale', float, ()),                       # share of the demand that the motors can meet
 ]
-"""Fields of the record of the outputs."""
 
 
 class LawOutput:

@@ -35,14 +35,14 @@ from fourbar_ros.mechanism.constants import Array
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+# Largest number of points: a trajectory is planned between two ticks of the controller.
 MAX_POINTS = 1000
-"""Largest number of points: a trajectory is planned between two ticks of the controller."""
 
+# Smallest time between two points [s]; closer points are a mistake.
 MIN_INTERVAL = 1e-3
-"""Smallest time between two points [s]; closer points are a mistake."""
 
+# Smallest number of instants in each piece at which it is checked.
 INSTANTS_PER_PIECE = 8
-"""Smallest number of instants in each piece at which it is checked."""
 
 
 @dataclass(frozen=True)

@@ -15,20 +15,16 @@ from fourbar_ros.mechanism.motors import SPEED_BANDWIDTH
 import numpy as np
 from numpy.typing import NDArray
 
+# Largest distance of a commanded speed from the measured one.
+#
+# It is a share of the distance at which the motor's speed loop asks for its torque limit. Beyond
+# that the command winds up and causes a late overshoot.
 SPEED_REACH = 0.8
-"""
-Largest distance of a commanded speed from the measured one.
 
-It is a share of the distance at which the motor's speed loop asks for its torque limit. Beyond
-that the command winds up and causes a late overshoot.
-"""
-
+# Speed below which the compensated Coulomb friction fades out [rad/s].
+#
+# The sign of a slower wheel is the rounding error of its encoder.
 FRICTION_SPEED = 0.5
-"""
-Speed below which the compensated Coulomb friction fades out [rad/s].
-
-The sign of a slower wheel is the rounding error of its encoder.
-"""
 
 
 @dataclass(frozen=True, eq=False)

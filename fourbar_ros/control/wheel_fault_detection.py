@@ -32,124 +32,113 @@ from fourbar_ros.mechanism.motors import (
 import numpy as np
 from numpy.typing import NDArray
 
+# Fault states of a wheel; arrays hold the index. From `dead` on a wheel is not used any more.
 FAULT_STATES = ('healthy', 'degraded', 'dead', 'stuck', 'runaway', 'shorted')
-"""Fault states of a wheel; arrays hold the index. From `dead` on a wheel is not used any more."""
 
 HEALTHY, DEGRADED, DEAD, STUCK, RUNAWAY, SHORTED = range(len(FAULT_STATES))
 
 # Detection of a broken wheel
 
+# Largest residual of a healthy wheel [rad/s].
 RESIDUAL_LIMIT = 2.5
-"""Largest residual of a healthy wheel [rad/s]."""
 
+# Consecutive ticks beyond the limit after which a wheel is not healthy.
 RESIDUAL_TICKS = 4
-"""Consecutive ticks beyond the limit after which a wheel is not healthy."""
 
+# Extra residual [rad/s] of a motor that was near its limit within this time [s].
+#
+# The speed loop in its electronics is known less well at the limit.
 STRAINED_ALLOWANCE, STRAINED_RECENTLY = 10.0, 0.3
-"""
-Extra residual [rad/s] of a motor that was near its limit within this time [s].
 
-The speed loop in its electronics is known less well at the limit.
-"""
-
+# Extra residual [rad/s] of a slow wheel under torque commands, which static friction holds back.
+#
+# Its model is led back to the wheel with this time constant [s].
 SLOW_ALLOWANCE, SLOW_RESET = 1.5, 2.0
-"""
-Extra residual [rad/s] of a slow wheel under torque commands, which static friction holds back.
 
-Its model is led back to the wheel with this time constant [s].
-"""
-
+# Time constants of the means for a broken and for a degraded wheel [s].
 MEAN_TIME, LONG_MEAN_TIME = 0.02, 0.5
-"""Time constants of the means for a broken and for a degraded wheel [s]."""
 
+# Time constants for learning the usual friction loss, and for leading models back [s].
+#
+# Models of a wheel and of its speed loop drift, since they integrate errors. The slow one applies
+# to a loss that is already half of what is reported.
 LEARNING_TIME, SLOW_LEARNING_TIME = 5.0, 30.0
-"""
-Time constants for learning the usual friction loss, and for leading models back [s].
-
-Models of a wheel and of its speed loop drift, since they integrate errors. The slow one applies
-to a loss that is already half of what is reported.
-"""
 
 # Thresholds as shares of the torque limit, or of FRICTIONS times the Coulomb friction if larger.
 
+# Smallest mean effort at which degradation is judged.
 FRICTIONS = 50.0
 MIN_EFFORT = 0.04
-"""Smallest mean effort at which degradation is judged."""
 
+# Increase of the friction loss that is degradation.
 FRICTION_LOSS = 8e-4
-"""Increase of the friction loss that is degradation."""
 
+# Largest effort of a motor that gives none.
 NO_TORQUE = 2e-3
-"""Largest effort of a motor that gives none."""
 
+# Effort beyond the expected from which a wheel is called runaway.
 UNCOMMANDED = 0.04
-"""Effort beyond the expected from which a wheel is called runaway."""
 
+# Lost torque from which a wheel is called stuck.
 BRAKED = 0.1
-"""Lost torque from which a wheel is called stuck."""
 
 # Thresholds as shares of the expected torque.
 
+# Largest effort of a dead motor.
 DEAD_SHARE = 0.15
-"""Largest effort of a dead motor."""
 
+# Torque that a healthy motor may lack under torque and under speed commands.
+#
+# A replica of the motor's speed loop is less exact, since it sees the speed less often.
 MISSING, MISSING_BY_SPEED = 0.2, 0.25
-"""
-Torque that a healthy motor may lack under torque and under speed commands.
 
-A replica of the motor's speed loop is less exact, since it sees the speed less often.
-"""
-
+# Share by which the inertia of a wheel may be wrong in the model.
 INERTIA_ERROR = 0.06
-"""Share by which the inertia of a wheel may be wrong in the model."""
 
 # Thresholds of a delayed motor
 
+# Mean residual of a delayed wheel under speed commands [rad/s].
 DELAY_RESIDUAL = 0.35
-"""Mean residual of a delayed wheel under speed commands [rad/s]."""
 
+# Under torque commands, ratio of mean squared errors without delay and with the best delay.
+#
+# The error without delay must also exceed this share of the torque limit.
 DELAY_RATIO, DELAY_VISIBLE = 4.0, 5e-4
-"""
-Under torque commands, ratio of mean squared errors without delay and with the best delay.
 
-The error without delay must also exceed this share of the torque limit.
-"""
-
+# First delay hypothesis [ticks], and number of ticks that are kept.
 FIRST_DELAY, DELAYS = 3, 32
-"""First delay hypothesis [ticks], and number of ticks that are kept."""
 
 # Conditions
 
+# Time for which degradation must last before it is reported [s].
 DEGRADED_TIME = 0.5
-"""Time for which degradation must last before it is reported [s]."""
 
+# Degradation is not judged above this share of the torque limit, nor for this time after [s].
 STRAINED, STRAINED_PAUSE = 0.5, 2.0
-"""Degradation is not judged above this share of the torque limit, nor for this time after [s]."""
 
+# Degradation is not judged for this time after another wheel broke [s].
+#
+# The others then give torques that they never gave before.
 BROKEN_PAUSE = 3.0
-"""
-Degradation is not judged for this time after another wheel broke [s].
 
-The others then give torques that they never gave before.
-"""
-
+# Friction is judged above this speed [rad/s], held for this time [s].
 MIN_SPEED, MIN_SPEED_TIME = 5.0, 0.8
-"""Friction is judged above this speed [rad/s], held for this time [s]."""
 
+# Largest speed of a wheel that stands still although it is driven [rad/s].
 STANDING = 1.0
-"""Largest speed of a wheel that stands still although it is driven [rad/s]."""
 
+# Time after the power cut in which a wheel must be undriven [s]; a shorted one is not.
 CUT_TIME = 0.15
-"""Time after the power cut in which a wheel must be undriven [s]; a shorted one is not."""
 
 # Models
 
+# Assumed period of the speed loop in the motor's electronics [s].
 LOOP_STEP = 5e-4
-"""Assumed period of the speed loop in the motor's electronics [s]."""
 
+# Longest integration step of the model [s].
 MODEL_STEP = 1e-3
-"""Longest integration step of the model [s]."""
 
+# Fields of the record of a control period.
 SAMPLE_FIELDS: Fields = [
     ('period', float, ()),              # s
     ('commands', float, (4,)),          # N m or rad/s
@@ -161,8 +150,8 @@ SAMPLE_FIELDS: Fields = [
     ('coulomb', float, ()),             # N m, of the bearings
     ('viscous', float, ()),             # N m s
 ]
-"""Fields of the record of a control period."""
 
+# Fields of the record of a wheel.
 WHEEL_FIELDS: Fields = [
     ('model_speed', float, ()),         # rad/s
     ('model_torque', float, ()),        # N m
@@ -195,7 +184,6 @@ WHEEL_FIELDS: Fields = [
     ('delay_errors', float, (DELAYS,)),  # N^2 m^2, mean squares of effort less these
     ('state', np.int64, ()),            # index of FAULT_STATES
 ]
-"""Fields of the record of a wheel."""
 
 
 class _Observation(NamedTuple):
