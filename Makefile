@@ -41,7 +41,7 @@ bench: $(INSTALLED)
 # Tests that start processes run one after the other in one worker; the other worker computes
 # meanwhile (test/conftest.py). One thread each, since there are as many workers as cores.
 PYTEST := OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest
-WORKERS := -q -n auto --dist loadscope
+WORKERS := -q -n auto --dist loadscope --no-loadscope-reorder
 
 test: $(INSTALLED)
 	@$(PYTEST) $(if $(ARGS),$(ARGS),$(WORKERS) -m 'not slow')

@@ -25,13 +25,12 @@ from fourbar_ros.device.interface import (
     Device,
     DeviceFault,
     Drive,
-    LinkSample,
     Reaction,
     Samples,
-    TrueState,
     WheelSample,
 )
 from fourbar_ros.device.supervisor import DeviceSupervisor, SupervisorSettings, Timing
+from fourbar_ros.mechanism.samples import LinkSample, TrueState
 
 __all__ = [
     'Arming', 'ClockMode', 'ClockModeError', 'Device', 'DeviceFault', 'DeviceState',

@@ -8,15 +8,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-from fourbar_ros.device.interface import (
-    Device,
-    Drive,
-    LinkSample,
-    no_torque,
-    Samples,
-    TrueState,
-    WheelSample,
-)
+from fourbar_ros.device.interface import Device, Drive, no_torque, Samples, WheelSample
 from fourbar_ros.mechanism import FLYWHEEL_NAMES
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.plant import Fault, InitialState, Plant
@@ -103,11 +95,9 @@ class SimulatedTable(Device):
         wheel_angles = self._plant.sense_wheels()
         speeds = (wheel_angles - self._wheel_angles) / (periods * self.period_ns * 1e-9)
         self._wheel_angles = wheel_angles
-        # The types of the device interface know no plant, so its records are copied into them.
-        links = tuple(LinkSample(**vars(reading))
-                      for reading in self._plant.link_sensors.due(stamp_ns))
-        return Samples(stamp_ns, links, WheelSample(wheel_angles, speeds, efforts),
-                       TrueState(**vars(self._plant.truth(efforts))))
+        return Samples(
+            stamp_ns, self._plant.link_sensors.due(stamp_ns),
+            WheelSample(wheel_angles, speeds, efforts), self._plant.truth(efforts))
 
     def diagnostics(self) -> dict[str, str]:
         """Return present faults, and whether the linkage has touched the edge of the table."""

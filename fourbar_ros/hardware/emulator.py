@@ -17,12 +17,13 @@ from dataclasses import dataclass
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.settings import setting, Settings
 from fourbar_ros.device.clock_modes import RealtimeClock
-from fourbar_ros.device.interface import Drive, LinkSample, Samples
+from fourbar_ros.device.interface import Drive, Samples
 from fourbar_ros.device.simulated import SimulatedTable
 from fourbar_ros.hardware import messages
 from fourbar_ros.hardware.firmware import Firmware
 from fourbar_ros.hardware.messages import Bus, BusError, Codec, COUNTERS, Frame, FrameError
 from fourbar_ros.mechanism import LINK_NAMES
+from fourbar_ros.mechanism.samples import LinkSample
 import numpy as np
 
 LINKS = range(4)

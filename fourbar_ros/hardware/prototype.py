@@ -23,7 +23,6 @@ from fourbar_ros.device.interface import (
     Device,
     DeviceFault,
     Drive,
-    LinkSample,
     no_torque,
     Samples,
     WheelSample,
@@ -34,6 +33,7 @@ from fourbar_ros.hardware.messages import Bus, BusError, Codec, COUNTERS, FrameE
 from fourbar_ros.hardware.safety_monitor import SafetyMonitor
 from fourbar_ros.hardware.safety_table import SafetyTable
 from fourbar_ros.mechanism import LINK_NAMES, Mechanism
+from fourbar_ros.mechanism.samples import LinkSample
 import numpy as np
 
 LINKS = range(4)

@@ -19,7 +19,7 @@ from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.operator.client import TestbedClient
 from fourbar_ros.operator.recorder import offered_qos, QUEUE_DEPTH
-from fourbar_ros.ros.environment import raise_priority, RosError
+from fourbar_ros.ros.environment import RosError
 from fourbar_ros.ros.messages import LATCHED, RELIABLE, stamp_of
 from fourbar_ros.ros.runtime import exempt_from_garbage_collection, flush
 import numpy as np
@@ -128,7 +128,6 @@ class Experiment:
         :raises KeyboardInterrupt: a signal arrived.
         """
         exempt_from_garbage_collection()    # a collection takes longer than a command timeout
-        raise_priority()
         topic = self._node.resolve_topic_name(names.FLYWHEEL_COMMAND)
         if self._testbed.wait(lambda: self._node.count_publishers(topic), DISCOVERY_TIME):
             raise RosError(f'{topic} has a publisher already: stop the controller')

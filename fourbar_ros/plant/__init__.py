@@ -4,12 +4,12 @@
 """The simulated table: the moving linkage, its flywheel motors and its sensors."""
 
 from fourbar_ros.plant.faults import Fault, FaultError, parse_fault
-from fourbar_ros.plant.plant import Plant, PlantError, Truth
-from fourbar_ros.plant.sensors import LinkSensorSettings, SensorReading
+from fourbar_ros.plant.plant import Plant, PlantError
+from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.settings import InitialState, SimulationSettings
 from fourbar_ros.plant.table import load_table, Table, TableError
 
 __all__ = [
     'Fault', 'FaultError', 'InitialState', 'LinkSensorSettings', 'load_table', 'parse_fault',
-    'Plant', 'PlantError', 'SensorReading', 'SimulationSettings', 'Table', 'TableError', 'Truth',
+    'Plant', 'PlantError', 'SimulationSettings', 'Table', 'TableError',
 ]

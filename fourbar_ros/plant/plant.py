@@ -10,7 +10,6 @@ table act at every step.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import isfinite
 
 from fourbar_ros.common.errors import FourbarError
@@ -18,6 +17,7 @@ from fourbar_ros.mechanism import assemble, LINK_NAMES, Mechanism
 from fourbar_ros.mechanism.change_points import RATES_UNDETERMINED
 from fourbar_ros.mechanism.constants import Array, record
 from fourbar_ros.mechanism.dynamics import gamma_matrix, mass_matrix
+from fourbar_ros.mechanism.samples import TrueState
 from fourbar_ros.mechanism.state import (
     CENTRE_POSITION,
     CENTRE_VELOCITY,
@@ -59,35 +59,6 @@ RELATIVE_RATES = np.array(
 
 class PlantError(FourbarError):
     """A plant that cannot be simulated, or whose state left the finite numbers."""
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """
-    The true state, without the errors of the sensors.
-
-    :param link_angles: (4,) continuous [rad].
-    :param link_rates: (4,) [rad/s].
-    :param wheel_angles: (4,) relative to the link, unwrapped [rad].
-    :param wheel_speeds: (4,) relative to the link [rad/s].
-    :param efforts: (4,) torque of each motor, mean over the last control period [N m].
-    :param random_walk_torques: (2,) random-walk torques on links a and b in that period [N m].
-    :param centre_position: (2,) of the mass centre of the whole, in frame `table` [m].
-    :param centre_velocity: (2,) [m/s].
-    :param base_position: (2,) of joint 1, the origin of the frame of link a [m].
-    :param base_velocity: (2,) [m/s].
-    """
-
-    link_angles: Array
-    link_rates: Array
-    wheel_angles: Array
-    wheel_speeds: Array
-    efforts: Array
-    random_walk_torques: Array
-    centre_position: Array
-    centre_velocity: Array
-    base_position: Array
-    base_velocity: Array
 
 
 class Plant:
@@ -247,7 +218,7 @@ class Plant:
         if not np.isfinite(self._state).all():
             raise PlantError('the state of the plant is no longer finite')
 
-    def truth(self, efforts: Array | None = None) -> Truth:
+    def truth(self, efforts: Array | None = None) -> TrueState:
         """
         Return a copy of the true state.
 
@@ -255,7 +226,7 @@ class Plant:
         """
         state = self._state.copy()
         base = np.array(joint_motion(0, state, self._constants))
-        return Truth(
+        return TrueState(
             state[LINK_ANGLES], state[LINK_RATES], state[WHEEL_ANGLES],
             state[WHEEL_SPEEDS] - state[LINK_RATES],
             self.efforts.copy() if efforts is None else efforts, self._random_walk.copy(),

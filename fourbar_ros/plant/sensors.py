@@ -22,6 +22,7 @@ from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.settings import setting, SettingError, Settings, settings_of
 from fourbar_ros.mechanism import JOINT_LINKS, JOINT_NAMES, LINK_NAMES
 from fourbar_ros.mechanism.constants import Array
+from fourbar_ros.mechanism.samples import LinkSample
 from fourbar_ros.plant.faults import Fault
 import numpy as np
 
@@ -113,24 +114,6 @@ class LinkSensorSettings(Settings):
         return (*JOINT_NAMES, str(self.heading))
 
 
-@dataclass(frozen=True, eq=False)
-class SensorReading:
-    """
-    The samples of one instant that arrived together.
-
-    :param stamp_ns: time of measurement [ns].
-    :param names: the sensors with a sample, in the order of the settings' `sensor_names`.
-    :param angles: (n,) orientation of each in frame `table`, or of the joint's second link
-        relative to its first, in (-pi, pi] [rad].
-    :param rates: (n,) their rates [rad/s], or (0,) where no gyros are fitted.
-    """
-
-    stamp_ns: int
-    names: tuple[str, ...]
-    angles: Array
-    rates: Array
-
-
 class LinkSensors:
     """
     The sensors of the links, with samples on their way.
@@ -204,7 +187,7 @@ class LinkSensors:
             if sample is not None:
                 heappush(self._queue, sample)
 
-    def due(self, tick_ns: int) -> tuple[SensorReading, ...]:
+    def due(self, tick_ns: int) -> tuple[LinkSample, ...]:
         """
         Return the samples that have arrived by a tick, each once.
 
@@ -219,12 +202,12 @@ class LinkSensors:
         return tuple(self._reading(stamp_ns, list(samples))
                      for stamp_ns, samples in groupby(arrived, key=_STAMP))
 
-    def _reading(self, stamp_ns: int, samples: list[_Pending]) -> SensorReading:
+    def _reading(self, stamp_ns: int, samples: list[_Pending]) -> LinkSample:
         _, _, sensors, angles, rates = zip(*samples)
         names = self._names_of.get(sensors)
         if names is None:
             names = self._names_of[sensors] = tuple(self.names[index] for index in sensors)
-        return SensorReading(stamp_ns, names, np.array(angles),
+        return LinkSample(stamp_ns, names, np.array(angles),
                              np.array(rates) if self.settings.gyro else self._no_rates)
 
     def _at_joints(self, values: list[float]) -> list[float]:

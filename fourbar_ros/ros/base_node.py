@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from fourbar_ros.common.errors import FourbarError
 from fourbar_ros.common.settings import Setting, Settings, settings_of
 from fourbar_ros.kernels.compiler import announced
-from fourbar_ros.ros.environment import RosError
+from fourbar_ros.ros.environment import RosError, set_realtime_priority
 from fourbar_ros.ros.runtime import flush, one_line, Runtime
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -31,6 +31,12 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
 
+# Parameters of every node, beside those of its settings.
+COMMON_PARAMETERS = (
+    Setting('realtime_priority', 0, '', 'real-time priority of the process (SCHED_FIFO), 0 for '
+            'none', low=0, high=99),
+)
+
 _Settings = TypeVar('_Settings', bound=Settings)
 
 
@@ -39,7 +45,7 @@ class BaseNode(Node):
     A node whose parameters are declared by settings.
 
     :param name: default name of the node.
-    :param declarations: of all parameters.
+    :param declarations: of its parameters; `COMMON_PARAMETERS` are added.
     :ivar runtime: the ROS of this process.
     :ivar logger: of this node.
     :ivar values: value of each parameter by name, up to date.
@@ -52,8 +58,8 @@ class BaseNode(Node):
         self.runtime = runtime
         self.logger = Node.get_logger(self)
         self.values: dict[str, Any] = {}
-        self._declarations = {row.name: row for row in declarations}
-        for row in declarations:
+        self._declarations = {row.name: row for row in (*declarations, *COMMON_PARAMETERS)}
+        for row in self._declarations.values():
             # Integers are valid overrides of double parameters: the type must not be fixed.
             parameter = self.declare_parameter(row.name, row.default, ParameterDescriptor(
                 description=f'{row.meaning} [{row.unit}]' if row.unit else row.meaning,
@@ -63,7 +69,7 @@ class BaseNode(Node):
 
     @property
     def simulated_time(self) -> bool:
-        """Whether stamps are simulated time; then the process gets no real-time priority."""
+        """Whether stamps are simulated time."""
         return bool(self.get_parameter('use_sim_time').value)
 
     def parameters_changed(self, values: dict[str, Any]) -> None:
@@ -72,6 +78,16 @@ class BaseNode(Node):
 
         :raises FourbarError: the values are refused and nothing changed.
         """
+
+    def request_priority(self) -> None:
+        """Request the real-time priority of the parameters; a refusal is only logged."""
+        if priority := self.values['realtime_priority']:
+            try:
+                set_realtime_priority(priority)
+            except PermissionError:
+                self.logger.warning(
+                    f'realtime_priority {priority} is not permitted: raise the limit rtprio of '
+                    'this user (docs/install.md); the node runs without it')
 
     def run_once(self) -> None:
         """Run the next callback."""
@@ -153,9 +169,8 @@ def run_node(make_node: Callable[[Runtime], BaseNode], name: str, description: s
         with announced():
             node = make_node(runtime)
         runtime.executor.add_node(node)
-        # With simulated time the nodes wait for each other: real-time priority would only take
-        # the processor from other programs.
-        runtime.spin(node.run_once, real_time=not node.simulated_time)
+        node.request_priority()
+        runtime.spin(node.run_once)
     except (InvalidNamespaceException, InvalidNodeNameException, InvalidTopicNameException,
             ParameterException) as error:
         raise RosError(one_line(error)) from None

@@ -10,7 +10,6 @@ and look everything up without importing it.
 
 from __future__ import annotations
 
-from contextlib import suppress
 import ctypes
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -65,17 +64,16 @@ def check_environment() -> None:
                 'install it', name='RMW_IMPLEMENTATION', value=middleware) from None
 
 
-def raise_priority() -> None:
+def set_realtime_priority(priority: int) -> None:
     """
-    Give all threads of this process real-time priority, if the user has it (limit `rtprio`).
+    Give all threads of this process a real-time priority (SCHED_FIFO).
 
-    The lowest real-time priority is above every process without one. Without the permission
-    nothing changes.
+    :param priority: 1 to 99; every one is above all processes without one.
+    :raises PermissionError: the user does not have it (limit `rtprio`); nothing changed.
     """
-    with suppress(PermissionError):
-        for thread in os.listdir('/proc/self/task'):
-            os.sched_setscheduler(
-                int(thread), os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+    for thread in os.listdir('/proc/self/task'):
+        os.sched_setscheduler(
+            int(thread), os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
 
 
 def lower_priority() -> None:

@@ -21,14 +21,16 @@ from fourbar_ros.control.settings import PARAMETERS as CONTROLLER_PARAMETERS
 from fourbar_ros.estimation.estimator_settings import PARAMETERS as ESTIMATOR_PARAMETERS
 from fourbar_ros.loop import load_scenario
 from fourbar_ros.ros import hardware, plant, prototype_emulator
+from fourbar_ros.ros.base_node import COMMON_PARAMETERS
 
 TABLES: dict[str, Sequence[Setting]] = {
-    'plant': plant.PARAMETERS,
-    'hardware': hardware.PARAMETERS,
-    'prototype_emulator': prototype_emulator.PARAMETERS,
-    'estimator': ESTIMATOR_PARAMETERS,
-    'controller': CONTROLLER_PARAMETERS,
-}
+    node: (*settings, *COMMON_PARAMETERS) for node, settings in {
+        'plant': plant.PARAMETERS,
+        'hardware': hardware.PARAMETERS,
+        'prototype_emulator': prototype_emulator.PARAMETERS,
+        'estimator': ESTIMATOR_PARAMETERS,
+        'controller': CONTROLLER_PARAMETERS,
+    }.items()}
 
 
 def yaml_text() -> str:
@@ -80,7 +82,9 @@ def _markdown_line(rows: Sequence[Setting]) -> str:
     if row.choices is not None:
         allowed = ', '.join(f'`{choice}`' for choice in row.choices)
     elif row.limits is not None:
-        allowed = f'{row.limits[0]:g} to {row.limits[1]:g}'
+        # Whole numbers in full, but the largest seed, 2^63 - 1.
+        low, high = (f'{limit:.9g}' for limit in row.limits)
+        allowed = f'{low} to {high}'
     default = '' if row.default == '' else f'`{row.default}`'
     return (f'| {", ".join(f"`{each.name}`" for each in rows)} | {default} | {row.unit} | '
             f'{allowed} | {"yes" if row.live else "no"} | {row.meaning} |')

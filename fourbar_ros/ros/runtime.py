@@ -11,7 +11,7 @@ import signal
 import time
 from typing import Any
 
-from fourbar_ros.ros.environment import raise_priority, RosError
+from fourbar_ros.ros.environment import RosError
 import rclpy
 from rclpy.duration import Duration
 from rclpy.experimental.events_executor import EventsExecutor
@@ -76,17 +76,14 @@ class Runtime:
         """
         self.executor.spin_once(timeout_sec=timeout)
 
-    def spin(self, run_once: Callable[[], None], real_time: bool) -> None:
+    def spin(self, run_once: Callable[[], None]) -> None:
         """
         Call a function until a signal arrives or a callback fails.
 
         :param run_once: returns within a fraction of a second.
-        :param real_time: ask for real-time priority.
         :raises Exception: the failure of a guarded callback.
         """
         exempt_from_garbage_collection()
-        if real_time:
-            raise_priority()
         while not self.stopping and self.failure is None:
             run_once()
         if self.failure is not None:

@@ -59,7 +59,7 @@ def test_it_goes_out_on_the_branch_that_is_named_and_comes_back(
              pose(other, heading, theta), pose(PARALLELOGRAM, heading, inside))
     begins = [BEGIN + number * (DURATION + REST) for number in range(len(goals))]
     scenario = replace(
-        base, mechanism=giving(base.mechanism), model=giving(base.believed), seed=seed,
+        base, mechanism=giving(base.mechanism), model=giving(base.model), seed=seed,
         initial=InitialState(heading, heading + inside),
         estimator=replace(base.estimator, closure_tolerance=CLOSURE),
         controller=replace(base.controller, change_points='choose'),

@@ -57,7 +57,7 @@ def tell(scenario: Scenario, command: str, at: float, *faults: Fault) -> Story:
     """Break wheels during a quarter turn of the whole, and see what becomes of it."""
     loop = make_loop(replace(scenario, controller=replace(scenario.controller, command=command)))
     story, asked, before = Story(), np.zeros(4), np.zeros(4)
-    efforts, inertias = np.zeros(4), scenario.believed.flywheel_inertias
+    efforts, inertias = np.zeros(4), scenario.model.flywheel_inertias
     goal = np.array(scenario.setpoints[-1].positions)
     for tick, step in enumerate(run_scenario(scenario, loop)):
         since = tick * PERIOD_S - at
@@ -166,16 +166,16 @@ def test_a_lost_axis_is_named_and_the_other_one_held(command: str, scenario: Sce
 
 @pytest.mark.parametrize('command', COMMANDS)
 def test_nobody_is_named_without_reason(command: str, scenario: Scenario) -> None:
-    """Wheel and link inertias believed wrongly by 5 % are no reason, on either manoeuvre."""
+    """Wheel and link inertias assumed wrongly by 5 % are no reason, on either manoeuvre."""
     for seed in range(2):
         rng = np.random.default_rng(seed)
         real = scenario.mechanism
-        believed = replace(
+        model = replace(
             real, link_inertias=real.link_inertias * (1.0 + rng.choice([-0.05, 0.05], 4)),
             flywheel_inertias=real.flywheel_inertias * (1.0 + rng.choice([-0.05, 0.05], 4)))
         goal = (0.0, pi / 3.0 + pi / 4.0) if seed else (-pi / 2.0, -pi / 6.0)
         setpoint = replace(scenario.setpoints[0], names=LINK_NAMES[:2], positions=goal)
-        story = tell(replace(scenario, model=believed, setpoints=(setpoint,), seed=seed),
+        story = tell(replace(scenario, model=model, setpoints=(setpoint,), seed=seed),
                      command, 0.5)
         assert story.named == {}, f'seed {seed}'
         assert story.final < 0.1, f'seed {seed}'

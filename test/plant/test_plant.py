@@ -18,7 +18,8 @@ from fourbar_ros.mechanism import (
 )
 from fourbar_ros.mechanism.change_points import RATES_UNDETERMINED
 from fourbar_ros.mechanism.closure import BRANCHES
-from fourbar_ros.plant import InitialState, Plant, PlantError, Table, Truth
+from fourbar_ros.mechanism.samples import TrueState
+from fourbar_ros.plant import InitialState, Plant, PlantError, Table
 from fourbar_ros.plant.sensors import LinkSensorSettings
 from fourbar_ros.plant.table import WheelEncoders
 from hypothesis import given, settings
@@ -42,7 +43,7 @@ MOVING = InitialState(0.3, 1.6, 'open', 2.0, -1.0)
 TORQUES = np.array([3e-5, -2e-5, 4e-5, 1e-5])
 
 
-def absolute_speeds(truth: Truth) -> Array:
+def absolute_speeds(truth: TrueState) -> Array:
     return truth.wheel_speeds + truth.link_rates
 
 

@@ -11,13 +11,9 @@ from typing import Any
 
 from fourbar_ros.common.settings import SettingError
 from fourbar_ros.mechanism import LINK_NAMES
+from fourbar_ros.mechanism.samples import LinkSample
 from fourbar_ros.plant.faults import Fault, parse_fault, SENSOR_FAULTS
-from fourbar_ros.plant.sensors import (
-    LinkSensors,
-    LinkSensorSettings,
-    SensorError,
-    SensorReading,
-)
+from fourbar_ros.plant.sensors import LinkSensors, LinkSensorSettings, SensorError
 import hypothesis
 from hypothesis import strategies as st
 import numpy as np
@@ -73,7 +69,7 @@ def at_rest(stamp_ns: int) -> Array:
 
 
 def observe(sensors: LinkSensors, ticks: Sequence[int], truth: Callable[[int], Array] = at_rest,
-            *, patience: int = 20 * S) -> list[tuple[int, SensorReading]]:
+            *, patience: int = 20 * S) -> list[tuple[int, LinkSample]]:
     """Measure at every tick, and return with its tick all that ever arrived."""
     readings = []
     for tick in ticks:
@@ -83,7 +79,7 @@ def observe(sensors: LinkSensors, ticks: Sequence[int], truth: Callable[[int], A
     return readings + [(end, reading) for reading in sensors.due(end)]
 
 
-def by_sensor(readings: Sequence[tuple[int, SensorReading]], name: str) -> Samples:
+def by_sensor(readings: Sequence[tuple[int, LinkSample]], name: str) -> Samples:
     """Pick the samples of one sensor."""
     found = sorted((reading.stamp_ns, tick, *(
         values[reading.names.index(name)] if len(values) else nan
