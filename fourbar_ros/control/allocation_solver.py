@@ -38,10 +38,10 @@ RULE_FIELDS: Fields = [
 
 # Singular values of the wheel map between which a demand fades out.
 #
-# They are relative to a wheel of the largest inverse weight on its own axis. A demand is met in full
-# from WEAK on, where torques are up to ten times the demand, and not at all up to LOST. They are
-# not relative to the largest singular value, which grows without limit near a change point while the
-# other direction stays as good as ever.
+# They are relative to a wheel of the largest inverse weight on its own axis. A demand is met in
+# full from WEAK on, where torques are up to ten times the demand, and not at all up to LOST. They
+# are not relative to the largest singular value, which grows without limit near a change point
+# while the other direction stays as good as ever.
 WEAK = 0.1
 LOST = 0.05
 
@@ -149,7 +149,8 @@ def allocate(rule: Record, wheel_map: Array, demand: Array, motors: MotorState,
             goal *= scale
         if rule.kind == MIN_MAX_SPEED:
             # A null motion of the wheels must not disturb a direction that they cannot drive.
-            undisturbed = Problem(effectiveness, gains, goal, count, low.copy(), high.copy(), roots)
+            undisturbed = Problem(
+                effectiveness, gains, goal, count, low.copy(), high.copy(), roots)
             _balance(undisturbed, rule, motors.speeds, scale, x)
             _correct(problem, slack * scale, x)
         elif exceeded:

@@ -20,7 +20,8 @@ import numpy as np
 
 # Time constant of the mean drift of wheel speeds [s].
 #
-# It averages the noise of encoders and the lag of motors; nothing is predicted before it has passed.
+# It averages the noise of encoders and the lag of motors; nothing is predicted before it has
+# passed.
 DRIFT_TIME = 5.0
 
 # Share of a speed limit below which the margin causes a warning: room for a short manoeuvre.

@@ -94,10 +94,10 @@ def load_safety(name: str) -> SafetyTable:
         try:
             rule = table[name] = Rule.from_mapping(values[name], name)
         except SettingError as error:
-            raise error.at(f'{path}: {name}', SafetyError) from None
+            raise error.at(path, SafetyError) from None
         if rule.level < condition.least:
             least = condition.least.name.lower()
             raise SafetyError(
-                f'{path}: {name}: reaction must be at least {least}, got {rule.reaction}',
-                name='reaction', place=f'{path}: {name}', value=rule.reaction, limit=least)
+                f'{path}: {name}.reaction must be at least {least}, got {rule.reaction}',
+                name=f'{name}.reaction', place=str(path), value=rule.reaction, limit=least)
     return table

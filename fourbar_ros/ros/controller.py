@@ -24,7 +24,7 @@ from fourbar_ros.control.wheel_command import by_name
 from fourbar_ros.loop.stamp_pairing import LatenessDetector, StampPairs
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES, load_mechanism
 from fourbar_ros.ros import messages
-from fourbar_ros.ros.base_node import BaseNode, run_node
+from fourbar_ros.ros.base_node import BaseNode, run_node, settings_from
 from fourbar_ros.ros.messages import JointStatePublisher, stamp_of
 from fourbar_ros.ros.runtime import Runtime
 import numpy as np
@@ -46,7 +46,8 @@ class ControllerNode(BaseNode):
         super().__init__(runtime, 'controller', PARAMETERS)
         guard = runtime.guard
         self._controller = Controller(
-            load_mechanism(self.values['mechanism']), settings_from(self.values))
+            load_mechanism(self.values['mechanism']),
+            settings_from(ControllerSettings, self.values))
         self._pairs = StampPairs()
         # In simulated time the device waits for late nodes.
         self._lateness = None if self.simulated_time else LatenessDetector()
@@ -88,7 +89,7 @@ class ControllerNode(BaseNode):
 
     def parameters_changed(self, values: dict[str, Any]) -> None:
         """Change the settings of the controller."""
-        self._controller.tune(settings_from(values))
+        self._controller.tune(settings_from(ControllerSettings, values))
         self._status.publish_changes()
 
     def _on_device_status(self, message: DiagnosticStatus) -> None:
@@ -249,12 +250,6 @@ class StatusPublisher:
         if level == messages.OK and self._refused.update(controller.refused):
             return messages.WARN, f'{controller.mode}, setpoints were refused', values
         return level, summary, values
-
-
-def settings_from(values: dict[str, Any]) -> ControllerSettings:
-    """Return the settings of the controller from its parameters."""
-    return ControllerSettings(
-        **{name: value for name, value in values.items() if name != 'mechanism'})
 
 
 def main(argv: Sequence[str]) -> int:

@@ -26,7 +26,7 @@ from fourbar_ros.estimation.estimator_topics import (
 from fourbar_ros.estimation.wheel_motion import BY_SPEED
 from fourbar_ros.mechanism import load_mechanism
 from fourbar_ros.ros import messages
-from fourbar_ros.ros.base_node import BaseNode, run_node
+from fourbar_ros.ros.base_node import BaseNode, run_node, settings_from
 from fourbar_ros.ros.messages import JointStatePublisher, stamp_of
 from fourbar_ros.ros.runtime import Runtime
 from sensor_msgs.msg import JointState
@@ -42,9 +42,9 @@ class EstimatorNode(BaseNode):
 
     def __init__(self, runtime: Runtime) -> None:
         super().__init__(runtime, 'estimator', PARAMETERS)
-        values = dict(self.values)
         self._topics = EstimatorTopics(
-            load_mechanism(values.pop('mechanism')), EstimatorSettings(**values))
+            load_mechanism(self.values['mechanism']),
+            settings_from(EstimatorSettings, self.values))
         self._estimator = self._topics.estimator
         self._log, self._rejected = messages.ThrottledLog(self), messages.RecentIncrease()
         self._subscribed_to_commands, self._starts, self._ticks = False, 0, 0

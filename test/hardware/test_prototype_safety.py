@@ -466,15 +466,15 @@ def test_limits_and_reactions_may_be_changed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(('changes', 'values'), [
     ({'hot': None}, {'missing': ['hot']}),
     ({'cold': {'limit': 1.0, 'lasting': 0.0, 'reaction': 'warn'}}, {'unknown': ['cold']}),
-    ({'hot': {'limit': -1.0}}, {'name': 'limit', 'value': -1.0, 'limit': (0.0, inf)}),
-    ({'hot': {'limit': 'much'}}, {'name': 'limit', 'value': 'much', 'limit': float}),
-    ({'hot': {'lasting': nan}}, {'name': 'lasting', 'limit': (0.0, inf)}),
-    ({'hot': {'lasting': inf}}, {'name': 'lasting', 'value': inf, 'limit': (0.0, inf)}),
+    ({'hot': {'limit': -1.0}}, {'name': 'hot.limit', 'value': -1.0, 'limit': (0.0, inf)}),
+    ({'hot': {'limit': 'much'}}, {'name': 'hot.limit', 'value': 'much', 'limit': float}),
+    ({'hot': {'lasting': nan}}, {'name': 'hot.lasting', 'limit': (0.0, inf)}),
+    ({'hot': {'lasting': inf}}, {'name': 'hot.lasting', 'value': inf, 'limit': (0.0, inf)}),
     ({'hot': {'reaction': 'panic'}},
-     {'name': 'reaction', 'value': 'panic', 'limit': ('warn', 'coast', 'stop')}),
+     {'name': 'hot.reaction', 'value': 'panic', 'limit': ('warn', 'coast', 'stop')}),
     ({'hot': {'colour': 'red'}}, {'unknown': ['colour']}),
     ({'wheel_silent': {'reaction': 'warn'}},
-     {'name': 'reaction', 'value': 'warn', 'limit': 'coast'}),
+     {'name': 'wheel_silent.reaction', 'value': 'warn', 'limit': 'coast'}),
 ])
 def test_invalid_table_is_refused(tmp_path: Path, changes, values, refuses) -> None:
     with refuses(SafetyError, **values):
