@@ -81,8 +81,9 @@ def generate_launch_description():
             description='preset (prototype) or path of the DBC file; empty: as in params_file'),
         DeclareLaunchArgument(
             'safety', default_value='',
-            description='preset (prototype) or path of a table of limits and reactions; empty: '
-                        'as in params_file'),
+            description='preset (prototype, emulated) or path of a table of limits and '
+                        'reactions; as in params_file unless given here, emulated if the links '
+                        'are emulated'),
         DeclareLaunchArgument(
             'rate', default_value='',
             description='control rate [Hz], 250.0 unless given here or in params_file'),
@@ -121,6 +122,8 @@ def start_nodes(context):
         given = {name: kind(argument(name)) for name, (owners, kind) in PARAMETERS.items()
                  if executable in owners and argument(name)}
         given.update(buses.get(executable, {}))
+        if emulate and executable == 'hardware':
+            given.setdefault('safety', 'emulated')
         nodes.append(Node(
             package='fourbar_ros', executable=executable, namespace=argument('namespace'),
             parameters=[*files, *([given] if given else [])], output='screen'))

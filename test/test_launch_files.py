@@ -183,8 +183,10 @@ def test_emulated_links_are_on_the_bus_of_the_host(monkeypatch, given, host, lin
         monkeypatch, PROTOTYPE, {'emulate': 'true', 'codec': 'odrive', **given})
     assert list(started) == ['prototype_emulator', 'hardware', 'estimator', 'controller']
     for name, bus in (('hardware', host), ('prototype_emulator', links)):
+        safety = {'safety': 'emulated'} if name == 'hardware' else {}
         assert started[name] == {
-            'codec': 'odrive', **dict(zip(('bus.interface', 'bus.channel', 'bus.options'), bus))}
+            'codec': 'odrive', **safety,
+            **dict(zip(('bus.interface', 'bus.channel', 'bus.options'), bus))}
 
 
 def test_channels_of_emulated_links_are_the_defaults_of_their_node(monkeypatch):

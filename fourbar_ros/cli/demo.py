@@ -215,7 +215,7 @@ def _prototype_parameters(plant: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return {
         'prototype_emulator': {
             **table, **bus(links, host), 'command_timeout': COMMAND_TIMEOUT_S},
-        'hardware': {**device, **bus(host, links)},
+        'hardware': {**device, **bus(host, links), 'safety': 'emulated'},
     }
 
 

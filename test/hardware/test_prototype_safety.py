@@ -458,6 +458,15 @@ def write(tmp_path: Path, **changes) -> str:
     return str(path)
 
 
+def test_emulated_links_differ_only_in_waits() -> None:
+    """And they wait for an answer as long as a shared computer may stall, half a second."""
+    real, emulated = load_safety('prototype'), load_safety('emulated')
+    assert {name for name in real if real[name] != emulated[name]} == {
+        'wheel_silent', 'heartbeat_lost'}
+    assert emulated['wheel_silent'].limit == 0.5
+    assert emulated['wheel_silent'].level == real['wheel_silent'].level
+
+
 def test_limits_and_reactions_may_be_changed(tmp_path: Path) -> None:
     table = load_safety(write(tmp_path, hot={'limit': 50.0, 'reaction': 'coast'}))
     assert (table['hot'].limit, table['hot'].level) == (50.0, Reaction.COAST)

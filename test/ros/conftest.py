@@ -329,6 +329,7 @@ class Suite:
         else:
             for name, values in on_a_bus().items():
                 given[name].update(values)
+            given['hardware']['safety'] = 'emulated'
             given['prototype_emulator'].update(emulator or {})
         given[device].update(parameters or {})
         return {name: self.node(name, given[name], namespace) for name in DEVICES[device]}

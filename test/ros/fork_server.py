@@ -10,6 +10,7 @@ but the idle tracers of the middleware, so a child starts where `python -m fourb
 its imports, and ends like it.
 """
 
+import ctypes
 import gc
 import json
 import os
@@ -17,6 +18,9 @@ import signal
 import subprocess
 import sys
 import time
+
+# Option of prctl: signal that the process gets when its parent ends.
+PR_SET_PDEATHSIG = 1
 
 
 class ForkServer:
@@ -116,7 +120,8 @@ def _serve():
 
 
 def _become(arguments, folder, out, err, environment):
-    """Put this process where a new one would be started."""
+    """Put this process where a new one would be started, and end it with its parent."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(folder)

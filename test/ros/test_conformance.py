@@ -4,6 +4,7 @@
 """What a testbed is to others: the same of the simulated table and of the prototype on its bus."""
 
 from math import inf, nan, pi
+import signal
 
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES
 import numpy as np
@@ -97,6 +98,10 @@ def bench(request, module_suite, make_probe):
     probe.status('device_status')
     yield Bench(name, processes, probe)
     probe.drive(None)
+    # The nodes of the next device need the processor.
+    for process in reversed(processes.values()):
+        process.end(signal.SIGINT)
+        process.check_clean()
 
 
 @pytest.fixture(autouse=True)

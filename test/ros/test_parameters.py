@@ -3,6 +3,8 @@
 
 """Parameters: declared as the tables say, checked at start and at run time."""
 
+import os
+
 from fourbar_ros.common.config_files import share_directory
 from fourbar_ros.ros.parameters import TABLES, yaml_text
 import numpy as np
@@ -265,6 +267,21 @@ def test_shipped_file_works_in_a_namespace(suite, make_probe):
     watcher.follow('flywheel_command', 'flywheel_states')
     first, second = watcher.more('flywheel_states', 2)
     assert (second.header.stamp.nanosec - first.header.stamp.nanosec) % 8_000_000 == 0
+
+
+@pytest.mark.parametrize('priority', [0, 1])
+def test_realtime_priority_is_only_that_which_was_asked_for(suite, make_probe, priority):
+    """And a node that may not have it says so and runs."""
+    namespace = f'/priority_{priority}'
+    process = suite.node('estimator', {'realtime_priority': priority}, namespace)
+    make_probe(namespace).diagnostics(f'{namespace[1:]}/estimator')
+    pid = process.popen.pid
+    policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
+    if priority and policy != os.SCHED_FIFO:
+        assert 'realtime_priority' in process.stderr
+    else:
+        assert policy == (os.SCHED_FIFO if priority else os.SCHED_OTHER)
+        assert os.sched_getparam(pid).sched_priority == priority
 
 
 @pytest.fixture(scope='module')
