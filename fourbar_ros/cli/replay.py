@@ -35,8 +35,8 @@ bags and settings give equal files. Settings are the parameters of the estimator
 defaults of the node; the settings of the recorded run are not in BAG.
 """
 NODE = 'estimator'
-# Parameters of any ROS node.
-COMMON_PARAMETERS = ('use_sim_time', 'start_type_description_service')
+# Parameters of every node that no estimate depends on.
+COMMON_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'realtime_priority')
 
 
 class SettingsError(FourbarError):
