@@ -18,7 +18,7 @@ from typing import Any
 from fourbar_ros import studies
 from fourbar_ros.cli.main import main
 from fourbar_ros.common.checks import at_most
-from fourbar_ros.studies import consistency, Progress, Result, validation
+from fourbar_ros.studies import consistency, consistency_results, Progress, Result, validation
 import pytest
 
 Stub = Callable[[Callable[[Progress], Result]], None]
@@ -85,7 +85,7 @@ def test_consistency_is_the_same_whatever_the_number_of_processes(
     kinds = [replace(case, scenario=replace(case.scenario, duration=0.6))
              for case in consistency.cases() if case.name in ('matched', 'prototype')]
     monkeypatch.setattr(consistency, 'cases', lambda: kinds)
-    monkeypatch.setattr(consistency, 'SETTLED_AT', 0.3)
+    monkeypatch.setattr(consistency_results, 'SETTLED_AT', 0.3)
     outputs = []
     for jobs in ('1', '2'):
         folder = tmp_path / jobs

@@ -185,9 +185,10 @@ def test_idle_controller_gives_no_torque_and_takes_nothing(testbed, publisher):
         assert list(message.effort) == [0.0] * 4
     for service in ('hold', 'damp'):
         response = testbed.trigger(service)
-        assert (response.success, response.message) == (False, 'the controller is not enabled')
+        assert not response.success
+        assert 'not enabled' in response.message
     verdict = testbed.setpoint_verdict(trajectory(['link_a'], [([0.1], 5.0, {})]), publisher)
-    assert verdict['last_refusal'] == 'the controller is not enabled'
+    assert 'not enabled' in verdict['last_refusal']
     response = testbed.call(SetBool, 'enable', SetBool.Request(data=True))
     assert (response.success, response.message) == (True, 'enabled')
     testbed.status('controller_status', mode='hold')
@@ -219,8 +220,8 @@ def test_gains_that_are_unstable_at_this_rate_are_refused(testbed):
     assert set_value(testbed, 'controller', 'damping', 2.0) == (True, '')
     accepted, reason = set_value(testbed, 'controller', 'bandwidth', 20.0)
     assert not accepted
-    assert reason.startswith(
-        'bandwidth 20 rad/s with damping 2 is not stable at 50 Hz, at most ')
+    for value in ('20 rad/s', '50 Hz'):
+        assert value in reason
     values = testbed.call(GetParameters, 'controller/get_parameters', GetParameters.Request(
         names=['bandwidth'])).values
     assert values[0].double_value == 4.0

@@ -107,10 +107,10 @@ def test_wheel_that_is_not_named_loses_its_power(kind, cut, testbed):
 
 
 @pytest.mark.parametrize(('name', 'text', 'word'), [
-    ('fault.link_a', 'broken', "unknown fault 'broken' of link_a"),
-    ('fault.link_a', 'intermittent 1.5', 'from 0 to 1'),
-    ('fault.joint_1', 'off', 'there is no joint_1 here'),
-    ('fault.flywheel_a', 'weak x', "must be a number, got 'x'"),
+    ('fault.link_a', 'broken', 'broken'),
+    ('fault.link_a', 'intermittent 1.5', '1.5'),
+    ('fault.joint_1', 'off', 'no joint_1'),
+    ('fault.flywheel_a', 'weak x', "'x'"),
     ('fault_schedule', '/nowhere/faults.yaml', '/nowhere/faults.yaml')])
 def test_fault_that_cannot_be_is_refused_and_changes_nothing(testbed, name, text, word):
     accepted, reason = set_fault(testbed, name, text)
