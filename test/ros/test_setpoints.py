@@ -28,8 +28,8 @@ WRONG = {
     'twice': ([['link_a', 'link_a'], [0.0, 0.0]], 'twice'),
     'too few': ([['link_a', 'link_b'], [0.0]], '2 names but 1'),
     'too many': ([['link_a'], [0.0, 0.0]], '1 names but 2'),
-    'empty': ([[], []], 'is named'),
-    'nameless': ([[], [0.0, 1.57]], 'is named'),
+    'empty': ([[], []], 'no name'),
+    'nameless': ([[], [0.0, 1.57]], 'no name'),
     'contradictory': ([['link_a', 'link_b', 'link_c'], [0.0, 1.2, 0.5]], 'link_c'),
 }
 
@@ -191,7 +191,7 @@ def test_setpoint_while_disarmed_is_refused_and_not_kept(started, publisher):
     verdict = started.setpoint_verdict(
         JointState(name=['link_a'], position=[0.5]), publisher)
     assert int(verdict['refused']) == int(before['refused']) + 1
-    assert verdict['last_refusal'] == 'the device is not armed'
+    assert 'not armed' in verdict['last_refusal']
     assert (verdict['mode'], verdict['goal']) == ('disarmed', '')
     assert not any(any(message.effort) for message in started.more('flywheel_command', 50))
     started.arm()
