@@ -108,6 +108,7 @@ def test_tags_are_balanced(written):
     assert parser.stack == []
 
 
+@pytest.mark.slow
 def test_size_does_not_grow_with_the_recording(synthetic, tmp_path):
     bag = synthetic.write_bag(tmp_path / 'bag', synthetic.motion_messages(rate_hz=250))
     report.write_report(bag, tmp_path / 'r.html', tmp_path / 'm.json', PAPER)
@@ -130,6 +131,7 @@ def test_thinning_keeps_every_peak(thin):
     assert np.array_equal(y[kept_x.astype(int)], kept_y)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('topics', 'absent'), [
     (['timing'], {'timing'}),
     (['estimate/innovation'], {'innovations'}),

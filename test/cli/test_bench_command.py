@@ -57,6 +57,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, dict[str, A
     return main(['bench', '--repeats', '2', '--json', str(path)]), strict(path)
 
 
+@pytest.mark.slow
 def test_exit_code_is_that_of_the_checks(measured: tuple[int, dict[str, Any]]) -> None:
     code, document = measured
     assert len(document['checks']) >= 6

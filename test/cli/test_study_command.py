@@ -40,6 +40,7 @@ def result(value: float) -> Result:
                   {'sum.csv': 'sum\n', 'sum.png': b'\x89PNG'}, ['no second line: no ink'])
 
 
+@pytest.mark.slow
 def test_validation_passes_its_checks_and_writes_its_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -742,6 +742,7 @@ def named(run: Run, ticks: int, offsets: Array, wrong: int) -> tuple[float, floa
     return after, worst
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('degrees', 'seed'), [(0.3, 0), (-0.3, 1), (-0.5, 2)])
 @pytest.mark.parametrize('wrong', range(4))
 def test_small_bias_of_a_sensor_is_isolated(

@@ -6,6 +6,8 @@
 import subprocess
 import sys
 
+import pytest
+
 # Loaded by the whole of filterpy, and not needed by the filter.
 HEAVY = ('matplotlib', 'scipy.stats', 'scipy.optimize', 'scipy.ndimage')
 
@@ -23,6 +25,7 @@ def test_import_of_the_estimator_loads_no_plotting_and_no_statistics() -> None:
     assert set(HEAVY).isdisjoint(loaded)
 
 
+@pytest.mark.slow
 def test_later_import_of_filterpy_is_complete() -> None:
     """Before and after, it is the real package, and its filter is the same class."""
     after = run(

@@ -45,6 +45,7 @@ def pose(branch: Branch, heading: float, theta: float) -> tuple[float, ...]:
     return tuple(branch.to_links(path, np.full(2, branch.pair_angle)).tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', SEEDS)
 @pytest.mark.parametrize(('theta', 'other'), [(0.0, FOLDED), (pi, CROSSED)],
                          ids=['folded', 'crossed'])

@@ -78,6 +78,7 @@ def answer(loop: ClosedLoop, stamp_ns: int, samples: Samples, now_ns: int) -> No
         loop.supervisor.command(stamp_ns, names, (), velocities, efforts, now_ns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('preset', ['paper', 'prototype'])
 @pytest.mark.parametrize('command', ['effort', 'velocity'])
 @pytest.mark.parametrize(('loss', 'longest'), [(0.05, 5), (0.01, 40)])

@@ -16,7 +16,7 @@ import pytest
 
 Array = NDArray[np.float64]
 PERIOD_S = 4e-3
-COMMANDS = ('velocity', 'effort')
+COMMANDS = ('velocity', pytest.param('effort', marks=pytest.mark.slow))
 
 # What the fault may cost.
 LARGEST_FINAL_ERROR, LARGEST_TRANSIENT = 0.2, 3.0   # deg

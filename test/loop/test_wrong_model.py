@@ -57,6 +57,7 @@ def tracking(links: float, wheels: float, by: tuple[float, float]) -> Array:
     return np.degrees(errors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('by', [(pi / 2, pi / 2), (0.0, pi / 4)], ids=['whole', 'configuration'])
 @pytest.mark.parametrize(('links', 'wheels'), [(1.05, 0.95), (0.95, 1.05)])
 def test_errors_stay_small_and_at_rest_it_does_not_hunt(

@@ -77,6 +77,7 @@ def test_collection_is_complete_beside_the_plugin(plugin: dict[str, str]) -> Non
     assert counted(beside.stdout, 'collected') == counted(alone.stdout, 'collected') > 5000
 
 
+@pytest.mark.slow
 def test_collection_needs_no_package_that_ros_lacks(plugin: dict[str, str]) -> None:
     """Without the optional packages only the tests of campaigns are left out."""
     result = run_pytest('--collect-only',

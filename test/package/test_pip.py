@@ -12,7 +12,7 @@ import sys
 
 import pytest
 
-pytestmark = pytest.mark.package
+pytestmark = [pytest.mark.package, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 CASE = ROOT / 'config' / 'reference' / 'paper_pair_ac.json'

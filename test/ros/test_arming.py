@@ -273,7 +273,9 @@ def moving(suite, make_probe):
     return nodes, watcher
 
 
-@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGSTOP], ids=lambda n: n.name)
+@pytest.mark.parametrize(
+    'number', [pytest.param(signal.SIGKILL, marks=pytest.mark.slow), signal.SIGSTOP],
+    ids=lambda n: n.name)
 def test_lost_controller_leaves_the_wheels_coasting(moving, make_probe, number):
     nodes, watcher = moving
     controller = nodes['controller']

@@ -106,6 +106,7 @@ def test_guard_tells_who_stands_still_and_time_waits(nodes):
     assert_no_tick_is_missing(testbed, plant)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', ['controller', 'estimator'])
 def test_loop_goes_on_disarmed_when_a_node_was_restarted(nodes, suite, name):
     namespace, testbed, processes = nodes('plant', 'estimator', 'controller')

@@ -291,7 +291,8 @@ def test_links_may_come_late_and_who_is_missing_is_named(suite, make_probe):
 # How it ends
 
 @pytest.mark.parametrize(
-    'number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+    'number', [signal.SIGINT, signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)],
+    ids=lambda number: number.name)
 def test_last_word_on_the_bus_is_no_torque(suite, make_probe, number):
     """Links that would go on for long are let go at once."""
     bench = Bench(suite, make_probe, number.name.lower(), links_s=10.0, fresh=True)
@@ -315,6 +316,7 @@ def test_last_word_on_the_bus_is_no_torque(suite, make_probe, number):
     assert bench.probe.status('device_status', state='disarmed')['reason'] == 'the node ends'
 
 
+@pytest.mark.slow
 def test_links_let_go_by_themselves_when_the_host_is_killed(suite, make_probe):
     bench = Bench(suite, make_probe, 'killed')
     bench.drive()

@@ -6,8 +6,9 @@
 from dataclasses import replace
 import math
 
+from fourbar_ros.kernels.runge_kutta import Drive
 from fourbar_ros.mechanism import assemble, load_mechanism
-from fourbar_ros.mechanism.forces import surroundings
+from fourbar_ros.mechanism.forces import surroundings, System
 from fourbar_ros.mechanism.integration import advance_state
 from fourbar_ros.mechanism.state import LINK_ANGLES, make_state
 from fourbar_ros.plant import load_table
@@ -88,7 +89,8 @@ def test_torques_make_the_motion_against_friction(present: Design) -> None:
             stribeck_rate=float(around.stribeck_rate), smoothing=float(around.smoothing),
             link_drag=around.link_drag, link_spin_drag=around.link_spin_drag)
         for n in range(0, len(cost.times) - 2, 2):
-            advance_state(state, *cost.torques[n:n + 3], step, NOMINAL.constants, level)
+            advance_state(state, Drive(*cost.torques[n:n + 3]), step,
+                          System(NOMINAL.constants, level))
             worst = max(worst, float(np.abs(state[LINK_ANGLES] - cost.angles[n + 2]).max()))
         assert worst < 2e-3
 

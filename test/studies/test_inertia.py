@@ -147,6 +147,7 @@ def study(folder: Path | None, seed: int = 0):
     return inertia.run(lambda items, _: items, Sample(seed=seed, jobs=1), folder)
 
 
+@pytest.mark.slow
 def test_finished_searches_are_not_repeated(quick: list[int], tmp_path: Path) -> None:
     whole = study(tmp_path)
     assert quick == [0, 1, 2, 3, 4]
@@ -165,6 +166,7 @@ def test_finished_searches_are_not_repeated(quick: list[int], tmp_path: Path) ->
     assert study(None).data == whole.data
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_search(quick: list[int], tmp_path: Path) -> None:
     study(tmp_path)
     quick.clear()
@@ -189,6 +191,7 @@ def test_full_disk_leaves_no_incomplete_file(
     assert not list((tmp_path / 'searches').iterdir())
 
 
+@pytest.mark.slow
 def test_two_processes_with_the_same_searches_do_not_disturb_each_other(
         quick: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The other process stores all its searches just before this one stores its first."""

@@ -13,6 +13,7 @@ from fourbar_ros.analysis.calibration.wheel_identification import wheel_estimate
 from fourbar_ros.mechanism import Mechanism
 from fourbar_ros.plant import Table
 from fourbar_ros.plotting.style import render
+import pytest
 
 
 def test_wheels_are_drawn(prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
@@ -24,6 +25,7 @@ def test_wheels_are_drawn(prototype: Mechanism, lab: Table, excited: Callable[..
     assert render(lambda: wheels_figure(estimates), 'png').startswith(b'\x89PNG')
 
 
+@pytest.mark.slow
 def test_links_are_drawn(prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
     estimate = link_estimate(
         prototype, *excited(prototype, lab, MultiSine(prototype, 12.0, 0.02), 0))

@@ -52,6 +52,7 @@ def estimates(prototype: Mechanism, irregular: Mechanism, lab: Table, excited: C
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', START)
 def test_reduced_inertias_are_found_to_one_percent(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]], name: str) -> None:
