@@ -27,11 +27,11 @@ Array = NDArray[np.float64]
 settings.register_profile('patient', deadline=None)
 settings.load_profile('patient')
 
+# Passed tests per dot of a run with workers: ten thousand dots hide what matters.
 PASSED_PER_DOT = 100
-"""Passed tests per dot of a run with workers: ten thousand dots hide what matters."""
 _passed = count(1)
+# Niceness of computing tests: a tenth of a processor that a node wants as well.
 NICE = 10
-"""Niceness of computing tests: a tenth of a processor that a node wants as well."""
 
 
 @pytest.hookimpl(optionalhook=True)

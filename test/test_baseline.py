@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 
 BASELINE = Path(__file__).parent / 'data' / 'baseline'
+# Relative tolerance for a changed order of arithmetic.
 TOLERANCE = 1e-9
-"""Relative tolerance for a changed order of arithmetic."""
+# Absolute tolerance for residuals, which are differences of numbers of order one.
 ROUNDING = 1e-12
-"""Absolute tolerance for residuals, which are differences of numbers of order one."""
 CASES = ('paper_all', 'paper_pair_ac', 'asymmetric', 'parallelogram_offset_spinning')
 STUDIES = ('energy', 'conditioning', 'inertia', 'singularity', 'validation', 'design')
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""`fourbar bench` measures all quantities, and its exit code is that of its checks."""
+"""`fourbar bench`: all quantities are measured, and the exit code is that of the checks."""
 
 from importlib.util import find_spec
 import json
@@ -64,7 +64,7 @@ def test_exit_code_is_that_of_the_checks(measured: tuple[int, dict[str, Any]]) -
     assert code == (0 if all(check['passed'] for check in document['checks']) else 1)
 
 
-def test_every_number_is_there(measured: tuple[int, dict[str, Any]]) -> None:
+def test_all_quantities_are_measured(measured: tuple[int, dict[str, Any]]) -> None:
     document = measured[1]
     for name in (*OURS, *(BESIDE_MUJOCO if find_spec('mujoco') else ())):
         assert document[name] > 0.0, name
@@ -72,17 +72,17 @@ def test_every_number_is_there(measured: tuple[int, dict[str, Any]]) -> None:
         assert check['value'] == document[check['name']]
 
 
-def test_stretches_are_what_their_names_say(measured: tuple[int, dict[str, Any]]) -> None:
+def test_stretches_agree_with_their_names(measured: tuple[int, dict[str, Any]]) -> None:
     document = measured[1]
     assert document['near_alignment_largest_sine'] < 0.1 < 0.5 < document['smallest_sine']
-    # The motors are at their bounds at many ticks, and not at all of them.
+    # The motors are at their bounds at most ticks, and not at all of them.
     assert 0.5 < document['control_bounds_active'] < 0.95
     assert document['control_step_p50_us'] <= document['control_step_p99_us']
 
 
-def test_our_motion_is_exact(measured: tuple[int, dict[str, Any]]) -> None:
+def test_error_of_the_motion_is_of_order_four(measured: tuple[int, dict[str, Any]]) -> None:
     """
-    An error of order four in h times the fastest rate there is.
+    The error is of order four in h times the fastest rate.
 
     Links turn at up to 0.3 rad/s and torques vary with 2 pi 0.23 Hz, so (omega h)^4 = 4e-12.
     """
@@ -90,7 +90,7 @@ def test_our_motion_is_exact(measured: tuple[int, dict[str, Any]]) -> None:
 
 
 @needs_mujoco
-def test_mujoco_is_measured_at_its_better(measured: tuple[int, dict[str, Any]]) -> None:
+def test_mujoco_error_is_that_of_rk4(measured: tuple[int, dict[str, Any]]) -> None:
     document = measured[1]
     assert document['mujoco_rk4_error_rad'] < 1e-8 < document['mujoco_euler_error_rad'] < 1e-3
     assert document['mujoco_error_rad'] == document['mujoco_rk4_error_rad']
@@ -112,7 +112,7 @@ def test_without_mujoco_the_rest_is_measured(
     assert code == (0 if all(check['passed'] for check in document['checks']) else 1)
     for name in OURS:
         assert document[name] > 0.0
-    # The kernels of the benchmark itself are compiled each time, which is announced.
+    # The command announces the compilation of its own kernels, so the message is the last line.
     assert capsys.readouterr().err.splitlines()[-1] == f'fourbar bench: {document["skipped"][0]}'
     assert 'mujoco' in document['skipped'][0]
 

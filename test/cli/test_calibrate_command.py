@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""`fourbar calibrate --bag` as it is typed: files whole or not at all, and what is refused."""
+"""`fourbar calibrate --bag`: output files and refused input."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ def calibrate(*arguments):
 
 @pytest.fixture
 def jig(synthetic, tmp_path, monkeypatch):
-    """Record links in a jig, with known offsets and noise; seed 0. Work where the bag is."""
+    """Record links in a jig with known offsets and noise, seed 0, in the working directory."""
     generator = np.random.default_rng(0)
     stamps = range(1_000_000_000, 2_600_000_000, 4_000_000)
     still = np.zeros(4)
@@ -40,8 +40,8 @@ def jig(synthetic, tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_mechanism_file_has_the_offsets_and_all_else(jig, capsys):
-    """Five standard errors of the noise of 400 samples."""
+def test_mechanism_file_has_the_offsets_and_the_other_values(jig, capsys):
+    """The tolerance is five standard errors of 400 samples."""
     assert calibrate(*AT_POSE, '-o', 'new.yaml', '--json', 'found.json') == 0
     output, errors = capsys.readouterr()
     assert errors == ''
@@ -58,8 +58,8 @@ def test_mechanism_file_has_the_offsets_and_all_else(jig, capsys):
     assert [check['passed'] for check in found['checks']] == [True] * 8
 
 
-def test_offsets_add_up_and_notes_stay(jig):
-    """What the device took out already is part of the whole."""
+def test_offsets_are_added_to_earlier_ones_and_comments_are_kept(jig):
+    """The device has subtracted the earlier offsets from the samples."""
     assert calibrate(*AT_POSE, '-o', 'first.yaml') == 0
     assert calibrate(*AT_POSE, '--mechanism', 'first.yaml', '-o', 'second.yaml') == 0
     first, second = (load_mechanism(name).link_angle_offsets
@@ -68,7 +68,7 @@ def test_offsets_add_up_and_notes_stay(jig):
     assert len(calibration_notes(Path('second.yaml'))) == 2
 
 
-def test_existing_file_stays_unless_forced(jig, capsys):
+def test_existing_file_is_kept_unless_forced(jig, capsys):
     Path('new.yaml').write_text('mine')
     assert calibrate(*AT_POSE, '-o', 'new.yaml') == 2
     line, = capsys.readouterr().err.splitlines()

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""`fourbar demo` from start to report, interrupted, refused."""
+"""`fourbar demo`: complete, interrupted and refused."""
 
 from importlib.util import module_from_spec, spec_from_file_location
 import json
@@ -26,7 +26,7 @@ _spec.loader.exec_module(harness)
 compiled, domain, shared_memory = harness.compiled, harness.domain, harness.shared_memory
 module_suite, suite, fork_server = harness.module_suite, harness.suite, harness.fork_server
 
-# Long enough for a motion of twelve seconds that a busy machine stretches.
+# Time limit of a demo on a busy machine; its motion takes twelve seconds [s].
 DEMO_S = 180.0
 PEAK_SPEED = 62.37
 CHILDREN = {'plant', 'estimator', 'controller', 'record'}
@@ -41,13 +41,13 @@ def wait_for(condition, seconds=90.0):
 
 
 def children(process):
-    """Return the ids of the processes that a process started, by the command's name."""
+    """Return the ids of the child processes of a process, by the name of the command."""
     found = {}
     for folder in Path('/proc').glob('[0-9]*'):
         try:
             parent = (folder / 'stat').read_text().rpartition(')')[2].split()[1]
             words = (folder / 'cmdline').read_text().split('\0')
-        except OSError:     # it ended
+        except OSError:     # the process has ended
             continue
         if int(parent) == process.popen.pid and 'fourbar_ros' in words:
             found[words[words.index('fourbar_ros') + 1]] = int(folder.name)
@@ -60,7 +60,7 @@ def runs(pid):
 
 @pytest.fixture(scope='module')
 def both(module_suite, tmp_path_factory):
-    """Run one demo to its end, and another one on the same domain into its motion."""
+    """Run one demo to its end, and start another one on the same domain during the first."""
     output = tmp_path_factory.mktemp('demo') / 'out'
     output.mkdir()
     (output / 'notes.txt').write_text("not the demo's")
@@ -81,7 +81,7 @@ def metrics(both):
     return json.loads((both['output'] / 'metrics.json').read_text())
 
 
-def test_demo_succeeds_and_says_where_the_report_is(both):
+def test_demo_succeeds_and_prints_the_path_of_the_report(both):
     first, output = both['first'], both['output']
     assert (first.popen.returncode, first.stderr) == (0, '')
     assert first.stdout.splitlines()[-1].split() == ['Report', str(output / 'report.html')]
@@ -90,7 +90,7 @@ def test_demo_succeeds_and_says_where_the_report_is(both):
     assert (output / 'notes.txt').read_text() == "not the demo's"
 
 
-def test_demo_ran_its_parts_in_processes_of_their_own(both):
+def test_demo_runs_its_parts_in_their_own_processes(both):
     assert set(both['children']) == CHILDREN
     assert not any(runs(pid) for pid in both['children'].values())
     logs = {path.stem: path.read_text() for path in (both['output'] / 'logs').iterdir()}
@@ -112,7 +112,7 @@ def test_metrics_are_those_of_a_quarter_turn(metrics):
     assert 0.0 <= metrics['tracking']['final_error_rad'] <= half_degree
     assert 0.0 < metrics['estimate']['rms_error_rad'] <= radians(0.1)
     assert metrics['flywheel']['peak_speed_rad_s'] == pytest.approx(PEAK_SPEED, rel=0.1)
-    # Equation 7 with four wheels at that speed.
+    # Eq. 7 with four wheels at the peak speed.
     assert metrics['flywheel']['peak_energy_j'] == pytest.approx(
         4 * 0.5 * 3.4e-7 * PEAK_SPEED ** 2, rel=0.2)
     loop = metrics['loop']
@@ -127,7 +127,7 @@ def test_table_shows_the_metrics(both, metrics):
     assert f'{metrics["flywheel"]["peak_speed_rad_s"]:10.4g} rad/s' in out
 
 
-def test_bag_is_readable_and_whole(both):
+def test_bag_is_readable_and_complete(both):
     store = get_typestore(Stores.ROS2_JAZZY)
     with Reader(both['output'] / 'bag') as reader:
         counts = {name: topic.msgcount for name, topic in reader.topics.items()}
@@ -135,7 +135,7 @@ def test_bag_is_readable_and_whole(both):
         assert wanted | {'/diagnostics'} <= set(counts)
         assert all(counts[topic] for topic in wanted)
         assert counts['/setpoint'] == 1
-        # A tick every 4 ms over settling and the motion of ten seconds.
+        # Settling and the motion of ten seconds have one tick every 4 ms.
         assert counts['/flywheel_states'] > 2000
         setpoint, = [
             store.deserialize_cdr(data, connection.msgtype) for connection, _, data
@@ -149,7 +149,7 @@ def test_bag_is_readable_and_whole(both):
     assert states[-1] == 'disarmed'
 
 
-def test_second_demo_on_the_domain_is_refused_and_touches_nothing(both):
+def test_second_demo_on_the_domain_is_refused_and_has_no_effect(both):
     rival = both['rival']
     assert (rival.popen.returncode, rival.stdout) == (2, '')
     line, = rival.stderr.splitlines()
@@ -169,7 +169,7 @@ def test_interrupt_during_the_motion_stops_everything(suite, tmp_path):
     assert code == 130
     assert demo.stderr == 'fourbar demo: interrupted\n'
     assert not any(runs(pid) for pid in started.values())
-    # What was recorded until then is whole.
+    # The bag is readable up to the interrupt.
     with Reader(tmp_path / 'out' / 'bag') as reader:
         assert reader.message_count > 0
     for path in (tmp_path / 'out' / 'logs').iterdir():

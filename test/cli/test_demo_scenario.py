@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the demo takes from a scenario, and which it refuses, without starting anything."""
+"""Parameters of the demo from a scenario, and refused scenarios; no process is started."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import yaml
 
 
 @pytest.mark.parametrize('name', ['paper', 'prototype'])
-def test_nodes_get_the_scenario_with_the_duration_of_its_setpoint(
+def test_nodes_have_the_parameters_of_scenario_and_setpoint(
     name: str, tmp_path: Path,
 ) -> None:
     scenario = load_scenario(name)
@@ -26,12 +26,12 @@ def test_nodes_get_the_scenario_with_the_duration_of_its_setpoint(
                for key, section in yaml.safe_load(path.read_text()).items()}
     wanted = scenario.parameters()
     wanted['controller']['setpoint_duration'] = 10.0
-    # A busy machine is no broken wheel.
+    # The command timeout is longer, because a busy machine delays commands.
     assert written['plant'].pop('command_timeout') >= wanted['plant'].pop('command_timeout')
     assert written == wanted
 
 
-def test_estimator_and_controller_get_the_model_mechanism(tmp_path: Path) -> None:
+def test_estimator_and_controller_have_the_model(tmp_path: Path) -> None:
     content = yaml.safe_load((share_directory() / 'config' / 'scenario_paper.yaml').read_text())
     heavy = (share_directory() / 'config' / 'mechanism_paper.yaml').read_text().replace(
         '3.4e-7', '4.0e-7')
@@ -66,8 +66,8 @@ def test_scenario_without_exactly_one_setpoint_is_refused(
     assert preset.strip('./') in str(caught.value) or 'seed' in str(caught.value)
 
 
-def test_on_a_bus_the_parameters_of_the_plant_are_shared_out(tmp_path: Path) -> None:
-    """Each has what its table lists, and the two ends of the bus find each other."""
+def test_parameters_of_the_plant_are_divided_between_the_nodes_on_a_bus(tmp_path: Path) -> None:
+    """Each node has the parameters of its table, and the two ends of the bus are peers."""
     path = tmp_path / 'parameters.yaml'
     write_parameters(load_one_move('prototype'), 'prototype', path)
     written = {key.rpartition('/')[2]: values['ros__parameters']

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The command line as a whole: names, help, exit codes, and how errors are told."""
+"""The command line as a whole: names, help, exit codes and error messages."""
 
 import os
 import subprocess
@@ -14,21 +14,21 @@ from fourbar_ros.cli.main import COMMANDS, main, NODES
 from fourbar_ros.common.errors import FourbarError
 import pytest
 
-# Commands whose arguments or results are quantities, and a unit that --help must name.
+# Commands with quantities as arguments or results, and a unit that --help must name.
 UNITS = {'setpoint': '[rad]', 'simulate': '[s]'}
 HEAVY = ('numpy', 'numba', 'rclpy', 'matplotlib', 'rosbags', 'scipy')
 
 
 @pytest.fixture
 def stub(monkeypatch):
-    """Return a function that puts a function in the place of a command."""
+    """Return a function that replaces a command by a function."""
     def replace(run):
         module = SimpleNamespace(add_arguments=lambda parser: None, run=run)
         monkeypatch.setattr(command_line, '_module', lambda command: module)
     return replace
 
 
-def test_without_a_command_it_helps_and_fails(capsys):
+def test_missing_command_prints_the_help_and_fails(capsys):
     assert main([]) == 2
     out = capsys.readouterr().out
     for name, text in COMMANDS.items():
@@ -53,7 +53,7 @@ def test_unknown_command_is_refused_with_the_known_ones(capsys):
 
 
 @pytest.mark.parametrize('name', [name for name in COMMANDS if name not in NODES])
-def test_every_command_helps(name, capsys):
+def test_every_command_has_a_help_text(name, capsys):
     with pytest.raises(SystemExit) as done:
         main([name, '--help'])
     assert done.value.code == 0
@@ -62,7 +62,7 @@ def test_every_command_helps(name, capsys):
     assert UNITS.get(name, '') in out
 
 
-def test_command_gets_its_name_and_its_code_is_returned(stub):
+def test_exit_code_of_a_command_is_returned(stub):
     stub(lambda args: {'stop': 7}[args.command])
     assert main(['stop']) == 7
 
@@ -101,7 +101,7 @@ def test_end_of_the_reader_of_stdout_prints_nothing():
 
 @pytest.mark.parametrize('arguments', [['--help'], ['--version'], ['demo', '--help'],
                                        ['setpoint', '--help']])
-def test_help_waits_for_no_heavy_library(arguments):
+def test_help_imports_no_heavy_library(arguments):
     code = ('import sys; from fourbar_ros.cli.main import main\n'
             'try: main(sys.argv[1:])\n'
             'except SystemExit: pass\n'
@@ -111,7 +111,7 @@ def test_help_waits_for_no_heavy_library(arguments):
     assert done.stderr == '[]'
 
 
-def test_completion_knows_commands_and_their_options():
+def test_completion_lists_commands_and_their_options():
     def completed(line):
         read, write = os.pipe()
         # argcomplete answers on file descriptor 8.

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The commands of an operator as they are typed: to device and controller, and `status`."""
+"""Operator commands for device and controller, and `fourbar status`."""
 
 from importlib.util import module_from_spec, spec_from_file_location
 from math import radians
@@ -25,14 +25,14 @@ suite, fork_server = harness.suite, harness.fork_server
 COMMANDS = {'arm': [], 'disarm': [], 'stop': [], 'reset': [], 'status': [],
             'setpoint': ['link_a=0']}
 OF_CONTROLLER = ('enable', 'disable', 'hold', 'damp')
-# What a controller says of itself when a wheel is lost.
-TROUBLED = {'mode': 'hold', 'problem': 'axis b is lost: flywheel_b, flywheel_d cannot be used',
+# Status of a controller after wheel faults.
+DEGRADED = {'mode': 'hold', 'problem': 'axis b is lost: flywheel_b, flywheel_d cannot be used',
             'wheel_faults': 'flywheel_b: dead, flywheel_d: dead'}
 
 
 @pytest.fixture(scope='module')
 def fourbar(module_suite):
-    """Return a function that runs a command to its end: exit code, stdout, stderr."""
+    """Return a function that runs a command and returns exit code, stdout and stderr."""
     def run(name, *arguments, fresh=False):
         process = module_suite.start(name, *arguments, fresh=fresh)
         return process.end(), process.stdout, process.stderr
@@ -41,7 +41,7 @@ def fourbar(module_suite):
 
 @pytest.fixture(scope='module')
 def nodes(module_suite, probe):
-    """Run a testbed in no namespace, to be watched by the probe."""
+    """Run a testbed without a namespace, watched by the probe."""
     module_suite.nodes(controller={'setpoint_duration': 1.0})
     probe.follow('flywheel_command')
     probe.newest('flywheel_command')
@@ -65,33 +65,33 @@ def armed(testbed):
 
 class Lossy:
     """
-    A service that obeys every request, and whose first answer gets lost.
+    A service that handles every request and loses its first answer.
 
-    :ivar asked: how often it was asked.
+    :ivar requests: number of requests.
     """
 
     def __init__(self, node, kind, name):
-        self.asked = 0
+        self.requests = 0
         self._service = node.create_service(kind, name, self._obey)
         self._send, self._service.send_response = self._service.send_response, self._answer
 
     def _obey(self, _request, response):
-        self.asked += 1
-        response.success, response.message = True, f'obeyed {self.asked} times'
+        self.requests += 1
+        response.success, response.message = True, f'obeyed {self.requests} times'
         return response
 
     def _answer(self, *answer):
-        if self.asked > 1:
+        if self.requests > 1:
             self._send(*answer)
 
 
 @pytest.fixture(scope='module')
 def unanswered(module_suite, make_probe):
     """
-    Run commands, all at once, that get no answer or not the first one, and `status` there.
+    Run commands in parallel: without a server, or with a service that loses its first answer.
 
-    :returns: exit code, stdout and stderr by namespace and name; and how often the services
-        of /lossy were asked, by their names.
+    :returns: exit code, stdout and stderr by namespace and name; and the number of requests
+        of the services of /lossy, by their names.
     """
     there = make_probe('/lossy')
     services = {'arm': Lossy(there.node, SetBool, 'arm'),
@@ -102,7 +102,7 @@ def unanswered(module_suite, make_probe):
     statuses = {name: there.node.create_publisher(
         DiagnosticStatus, f'/lossy/{name}_status', harness.LATCHED)
         for name in ('device', 'controller')}
-    for name, values in (('device', {'state': 'armed'}), ('controller', TROUBLED)):
+    for name, values in (('device', {'state': 'armed'}), ('controller', DEGRADED)):
         statuses[name].publish(DiagnosticStatus(
             values=[KeyValue(key=key, value=value) for key, value in values.items()]))
     started = {(namespace, name): module_suite.start(
@@ -116,11 +116,11 @@ def unanswered(module_suite, make_probe):
         there.wait(lambda popen=process.popen: popen.poll() is not None)
     return ({key: (process.end(), process.stdout, process.stderr)
              for key, process in started.items()},
-            {name: service.asked for name, service in services.items()})
+            {name: service.requests for name, service in services.items()})
 
 
 @pytest.mark.parametrize('name', list(COMMANDS))
-def test_nobody_there_is_said_in_one_line(unanswered, name):
+def test_missing_device_is_reported_in_one_line(unanswered, name):
     code, out, err = unanswered[0]['/nobody', name]
     if name == 'status':
         assert (code, err) == (1, '')
@@ -132,7 +132,7 @@ def test_nobody_there_is_said_in_one_line(unanswered, name):
 
 
 @pytest.mark.parametrize('name', OF_CONTROLLER)
-def test_no_controller_there_is_said_in_one_line(unanswered, name):
+def test_missing_controller_is_reported_in_one_line(unanswered, name):
     assert unanswered[0]['/nobody', name] == (
         1, '', f'fourbar {name}: no controller found: service /nobody/'
         f'{"enable" if name == "disable" else name} did not appear within 5 s\n')
@@ -140,17 +140,17 @@ def test_no_controller_there_is_said_in_one_line(unanswered, name):
 
 @pytest.mark.parametrize(('name', 'service'), [
     ('disarm', 'arm'), ('disable', 'enable'), ('damp', 'damp')])
-def test_lost_answer_is_asked_for_again(unanswered, name, service):
+def test_idempotent_request_is_repeated_after_a_lost_answer(unanswered, name, service):
     results, asked = unanswered
     code, out, err = results['/lossy', name]
     assert (code, out.split()[0], err) == (0, 'obeyed', '')
-    # As often as it was asked until then: the second time, or later on a busy machine.
+    # The command returns the answer to the second request, or to a later one on a busy machine.
     assert 2 <= int(out.split()[1]) <= asked[service]
 
 
 @pytest.mark.parametrize(('name', 'service'), [
     ('sim', 'sim/step'), ('reset', 'reset_emergency_stop')])
-def test_what_must_not_be_done_twice_is_not_asked_for_again(unanswered, name, service):
+def test_other_request_is_not_repeated_after_a_lost_answer(unanswered, name, service):
     results, asked = unanswered
     assert results['/lossy', name] == (
         2, '', f'fourbar {name}: no answer from service /lossy/{service} within 5 s\n')
@@ -158,7 +158,7 @@ def test_what_must_not_be_done_twice_is_not_asked_for_again(unanswered, name, se
 
 
 def test_arm_and_disarm(testbed, fourbar):
-    # As they are typed, once; forked everywhere else.
+    # Only this test starts the commands in a fresh interpreter.
     assert fourbar('arm', fresh=True) == (0, 'armed\n', '')
     assert testbed.status('device_status', state='armed')['reason'] == 'armed on request'
     assert fourbar('arm') == (0, 'already armed\n', '')
@@ -178,7 +178,7 @@ def test_stop_refused_arming_and_reset(armed, fourbar):
     armed.status('device_status', state='disarmed')
 
 
-def test_status_tells_both(armed, fourbar):
+def test_status_shows_device_and_controller(armed, fourbar):
     code, out, err = fourbar('status')
     assert (code, err) == (0, '')
     values = dict(line.split(maxsplit=1) for line in out.splitlines() if len(line.split()) > 1)
@@ -189,23 +189,22 @@ def test_status_tells_both(armed, fourbar):
     assert lines.index('device') < lines.index('controller')
 
 
-def test_status_tells_what_is_wrong(unanswered):
+def test_status_shows_faults(unanswered):
     code, out, err = unanswered[0]['/lossy', 'status']
     assert (code, err) == (0, '')
-    told = [line.split(maxsplit=1) for line in out.splitlines()]
-    for key, value in TROUBLED.items():
-        assert [key, value] in told
+    shown = [line.split(maxsplit=1) for line in out.splitlines()]
+    for key, value in DEGRADED.items():
+        assert [key, value] in shown
 
 
-def test_status_has_a_line_for_what_may_go_wrong(armed, fourbar):
-    told = [line.split() for line in fourbar('status')[1].splitlines()]
-    assert ['mode', 'hold'] in told
-    # Nothing is.
-    assert ['problem'] in told
-    assert ['wheel_faults'] in told
+def test_status_has_empty_fault_lines_without_faults(armed, fourbar):
+    shown = [line.split() for line in fourbar('status')[1].splitlines()]
+    assert ['mode', 'hold'] in shown
+    assert ['problem'] in shown
+    assert ['wheel_faults'] in shown
 
 
-def test_hold_ends_a_move_and_damp_keeps_no_place(armed, fourbar):
+def test_hold_ends_a_move_and_damp_holds_no_position(armed, fourbar):
     assert fourbar('setpoint', 'link_b=70deg') == (0, 'accepted\n', '')
     assert fourbar('hold') == (0, 'holds\n', '')
     assert armed.status('controller_status', goal='')['mode'] == 'hold'
@@ -215,14 +214,14 @@ def test_hold_ends_a_move_and_damp_keeps_no_place(armed, fourbar):
     armed.status('controller_status', mode='hold')
 
 
-def test_hold_after_a_move_forgets_where_it_went(armed, fourbar):
+def test_hold_after_a_move_drops_its_goal(armed, fourbar):
     assert fourbar('setpoint', 'link_b=80deg') == (0, 'accepted\n', '')
     assert armed.status('controller_status', mode='hold')['goal'] != ''
     assert fourbar('hold') == (0, 'holds\n', '')
     armed.status('controller_status', mode='hold', goal='')
 
 
-def test_disable_takes_the_wheels_from_the_controller_until_enable(armed, fourbar):
+def test_disabled_controller_drives_no_wheel_until_it_is_enabled(armed, fourbar):
     assert fourbar('disable') == (0, 'not enabled: the wheels get no torque\n', '')
     armed.status('controller_status', mode='idle')
     assert list(armed.more('flywheel_command')[0].effort) == [0.0] * 4
@@ -233,7 +232,7 @@ def test_disable_takes_the_wheels_from_the_controller_until_enable(armed, fourba
 
 
 @pytest.mark.parametrize('name', ['hold', 'damp'])
-def test_what_only_an_armed_device_can_do_is_refused(testbed, fourbar, name):
+def test_command_that_needs_an_armed_device_is_refused(testbed, fourbar, name):
     assert fourbar(name) == (1, '', 'the device is not armed: arm it first\n')
 
 
@@ -257,7 +256,7 @@ def test_setpoint_while_disarmed_is_refused(testbed, fourbar):
         1, '', 'refused: the device is not armed: arm it first\n')
 
 
-def test_setpoint_that_cannot_be_read_never_reaches_ros(fourbar):
+def test_setpoint_with_bad_syntax_is_refused_without_ros(fourbar):
     code, out, err = fourbar('setpoint', 'link_a=0', 'link_b=up')
     assert (code, out) == (2, '')
     line, = err.splitlines()
@@ -265,7 +264,7 @@ def test_setpoint_that_cannot_be_read_never_reaches_ros(fourbar):
 
 
 def test_commands_in_a_namespace(suite, make_probe, fourbar):
-    # Two loops at full rate are more than two cores can do.
+    # Two cores are too slow for two loops at full rate.
     suite.nodes('/lab', plant={'rate': 100.0}, controller={'setpoint_duration': 1.0})
     watcher = make_probe('/lab')
     watcher.follow('flywheel_command')

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Child processes are stopped in order, and never outlive their parent."""
+"""Child processes are stopped in order and end with their parent."""
 
 from collections.abc import Iterator
 import os
@@ -15,8 +15,8 @@ from fourbar_ros.cli import processes
 from fourbar_ros.cli.processes import ProcessError, Processes
 import pytest
 
-# Stands in for `python -m fourbar_ros NAME ...`: takes down when it begins and when it is told to
-# end. `deaf` ignores requests, `brief` ends at once, `mute` does so without a word.
+# Replacement of `python -m fourbar_ros NAME ...` that logs its start and its signals. `deaf`
+# ignores signals, `brief` ends at once, `mute` ends at once without output.
 CHILD = """\
 #!{python}
 import os, signal, sys, time
@@ -56,7 +56,7 @@ PYTHON = sys.executable
 
 
 class Stage:
-    """Where the children play: their journal and logs."""
+    """A folder with the journal and the logs of the children."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -67,11 +67,11 @@ class Stage:
         self.child.chmod(0o755)
 
     def lines(self) -> list[list[str]]:
-        """Return the journal: name, what happened, process id."""
+        """Return the lines of the journal: name, event, process id."""
         return [line.split() for line in self.journal.read_text().splitlines()]
 
     def wait_for(self, count: int) -> list[list[str]]:
-        """Wait until so many lines are there."""
+        """Wait until the journal has this number of lines."""
         end = time.monotonic() + PATIENCE
         while len(self.lines()) < count:
             assert time.monotonic() < end, self.lines()
@@ -84,7 +84,7 @@ class Stage:
 
 
 def alive(pid: str) -> bool:
-    """Tell whether a process runs; a zombie that nobody waited for does not."""
+    """Return whether a process runs; a zombie does not run."""
     try:
         return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
     except OSError:
@@ -93,7 +93,7 @@ def alive(pid: str) -> bool:
 
 @pytest.fixture
 def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
-    """Let the stand-in be started in place of the package; clean up whatever happens."""
+    """Replace the package by the child program; kill the children after the test."""
     stage = Stage(tmp_path)
     monkeypatch.setattr(processes.sys, 'executable', str(stage.child))
     monkeypatch.setattr(processes, 'SIGNAL_TIMEOUT_S', 0.3)
@@ -103,7 +103,7 @@ def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
             os.kill(int(pid), signal.SIGKILL)
 
 
-def test_children_are_stopped_the_first_one_last(stage: Stage) -> None:
+def test_children_are_stopped_in_reverse_order(stage: Stage) -> None:
     with Processes(stage.folder, os.environ) as children:
         for count, name in enumerate(['one', 'two', 'three']):
             children.start(name)
@@ -133,7 +133,7 @@ def test_single_child_can_be_stopped_before_the_others(stage: Stage) -> None:
         assert ('two', 'SIGINT') not in stage.events()
 
 
-def test_child_that_does_not_listen_is_killed_in_the_end(stage: Stage) -> None:
+def test_child_that_ignores_signals_is_killed(stage: Stage) -> None:
     with Processes(stage.folder, os.environ) as children:
         children.start('deaf')
         stage.wait_for(1)
@@ -141,8 +141,8 @@ def test_child_that_does_not_listen_is_killed_in_the_end(stage: Stage) -> None:
     assert not alive(stage.lines()[0][2])
 
 
-def test_child_gets_its_name_arguments_environment_and_own_group(stage: Stage) -> None:
-    """In a group of its own, Ctrl-C on the terminal does not reach it."""
+def test_child_has_name_arguments_environment_and_own_group(stage: Stage) -> None:
+    """Ctrl-C on the terminal does not reach a process in its own group."""
     with Processes(stage.folder, {**os.environ, 'ANSWER': '42'}) as children:
         children.start('one', ['--rate', '5'])
         pid = stage.wait_for(1)[0][2]
@@ -154,7 +154,7 @@ def test_child_gets_its_name_arguments_environment_and_own_group(stage: Stage) -
 
 @pytest.mark.parametrize(('name', 'code', 'words'), [
     ('brief', 3, 'the last word'), ('mute', 4, 'no output')])
-def test_end_of_a_child_is_an_error_with_its_last_words(
+def test_end_of_a_child_is_an_error_with_its_last_line(
     name: str, code: int, words: str, stage: Stage,
 ) -> None:
     with Processes(stage.folder, os.environ) as children:
@@ -188,10 +188,10 @@ def test_children_end_with_a_parent_that_is_killed(stage: Stage) -> None:
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason='Python does not offer it')
-def test_package_in_the_folder_where_one_stands_is_not_what_runs(
+def test_package_in_the_working_directory_is_not_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A checkout of the package, another one than this."""
+    """The working directory has another checkout of the package."""
     other = tmp_path / 'fourbar_ros'
     other.mkdir()
     (other / '__init__.py').touch()

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""`fourbar replay` as it is typed."""
+"""The command `fourbar replay`."""
 
 from dataclasses import replace
 import json
@@ -27,7 +27,7 @@ def recorded(synthetic, tmp_path_factory):
 
 @pytest.fixture
 def bag(recorded, tmp_path, monkeypatch):
-    """Return the name of a bag in the working directory, with nothing else there."""
+    """Return the name of a bag in a working directory without other files."""
     shutil.copytree(recorded, tmp_path / 'run1')
     monkeypatch.chdir(tmp_path)
     return 'run1'
@@ -66,7 +66,7 @@ def test_used_settings_are_printed(bag, capsys):
                         'closure_tolerance': 0.0}
 
 
-def test_parameters_file_of_the_nodes_does_too_and_options_come_first(bag):
+def test_parameters_file_is_read_and_options_override_it(bag):
     text = (share_directory() / 'config' / 'nodes.yaml').read_text()
     Path('nodes.yaml').write_text(
         text.replace('angle_noise: 0.0017453', 'angle_noise: 0.003')
@@ -103,7 +103,7 @@ def test_every_setting_has_its_option(capsys):
     (['run1', '--params-file', 'odd.yaml'], 'angle_nose'),
     (['run1', '--params-file', 'flat.yaml'], 'ros__parameters'),
     (['run1', '--params-file', 'others.yaml'], 'others.yaml')])
-def test_bad_input_is_one_line_and_leaves_nothing_behind(bag, capsys, arguments, named):
+def test_bad_input_is_one_line_and_leaves_no_file(bag, capsys, arguments, named):
     Path('taken').mkdir()
     for name, text in (('odd', '/**/estimator: {ros__parameters: {angle_nose: 1.0}}'),
                        ('flat', 'estimator: {angle_noise: 1.0}'),

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""`fourbar report` as it is typed."""
+"""The command `fourbar report`."""
 
 import json
 from pathlib import Path
@@ -35,7 +35,7 @@ def test_files_are_beside_the_bag(bag):
     assert not list(bag.glob('*.html'))
 
 
-def test_files_go_where_they_are_asked_to(bag, tmp_path, monkeypatch):
+def test_files_are_written_to_the_given_paths(bag, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(['report', str(bag), '-o', 'a.html', '--metrics', 'b.json',
                  '--mechanism', 'paper']) == 0

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""`fourbar setpoint link_a=0 link_b=90deg`, as it is typed."""
+"""The arguments of `fourbar setpoint link_a=0 link_b=90deg`."""
 
 from math import pi, radians
 
@@ -22,7 +22,7 @@ import pytest
     ('link_d=450deg', 'link_d', 2.5 * pi),
     ('anything=1', 'anything', 1.0),
 ])
-def test_angles_are_in_radians_unless_they_say_degrees(
+def test_angles_are_in_radians_unless_they_have_the_unit_deg(
     text: str, name: str, angle: float,
 ) -> None:
     assert parse_goal(text) == (name, pytest.approx(angle, rel=1e-15))
@@ -41,6 +41,6 @@ def test_bad_syntax_is_refused_with_an_example(text: str) -> None:
 
 @settings(derandomize=True)
 @given(angle=st.floats(allow_nan=False, allow_infinity=False))
-def test_every_number_survives_its_way_through_the_command_line(angle: float) -> None:
+def test_every_number_is_read_back_from_its_text(angle: float) -> None:
     assert parse_goal(f'link_a={angle!r}') == ('link_a', angle)
     assert parse_goal(f'link_a={angle!r}deg') == ('link_a', radians(angle))

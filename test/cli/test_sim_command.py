@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""`fourbar sim` as it is typed, where it never reaches a plant."""
+"""The command `fourbar sim` without a plant."""
 
 import os
 

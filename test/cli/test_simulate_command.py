@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""`fourbar simulate` reproduces the reference motions, and says in one line what is wrong."""
+"""`fourbar simulate` reproduces the reference motions and reports bad input in one line."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,7 +22,7 @@ import pytest
 CASES = sorted((Path(__file__).parents[2] / 'config' / 'reference').glob('*.json'))
 HEADER = ('t,link_a,link_b,link_c,link_d,rate_a,rate_b,rate_c,rate_d,'
           'flywheel_a,flywheel_b,flywheel_c,flywheel_d')
-# What the command promises; the references themselves hold 1e-10.
+# Documented accuracy of the command; the references have an error of 1e-10.
 EXACT = 1e-8
 
 each_case = pytest.mark.parametrize('case', CASES, ids=lambda case: case.stem)
@@ -49,7 +49,7 @@ def test_reference_motion_is_reproduced(
     assert header == HEADER
     assert table[:, 0].tolist() == reference['t']
     np.testing.assert_allclose(table[:, 1:5], reference['link_angles'], rtol=0.0, atol=EXACT)
-    # Rates are angles per second, wheels a hundred rad/s and a hundred times lighter.
+    # Rates have ten times the tolerance of angles; wheel speeds have a relative tolerance.
     np.testing.assert_allclose(table[:, 5:9], reference['link_rates'], rtol=0.0, atol=10 * EXACT)
     np.testing.assert_allclose(
         table[:, 9:], reference['flywheel_speeds_absolute'], rtol=EXACT, atol=EXACT)
@@ -62,7 +62,7 @@ def test_numbers_have_twelve_significant_digits(case: Path, tmp_path: Path) -> N
     motion = simulate(load_case(case))
     exact = np.column_stack([motion.times, motion.link_angles, motion.link_rates,
                              motion.flywheel_speeds_absolute])
-    # Twelve digits round by at most half of the last one.
+    # The rounding error of twelve digits is half of the last digit.
     np.testing.assert_allclose(read(output)[1], exact, rtol=0.5e-11, atol=0.0)
 
 
@@ -86,7 +86,7 @@ def test_bad_input_ends_a_process_with_one_line(tmp_path: Path) -> None:
 
 
 def test_finer_step_gives_the_same_motion(tmp_path: Path) -> None:
-    """The step is a matter of accuracy alone; at 1 ms that is far below what is asked for."""
+    """At a step of 1 ms the truncation error is far below the documented accuracy."""
     tables = []
     for step in ('0.001', '0.0005'):
         output = tmp_path / f'{step}.csv'
@@ -110,7 +110,7 @@ def good() -> dict[str, Any]:
 
 @pytest.fixture
 def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Return a function that runs a case which must be refused, and returns the one line."""
+    """Return a function that runs a refused case and returns the error message."""
     def run(text: str | bytes | None, output: str = 'out.csv', *arguments: str) -> str:
         case = tmp_path / 'case.json'
         if text is not None:
@@ -130,7 +130,7 @@ def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[...,
 
 
 def changed(content: dict[str, Any], place: str, value: Any) -> str:
-    """Return the case with one value changed, or dropped if it is `...`."""
+    """Return the case with one changed value; `...` removes it."""
     *sections, name = place.split('.')
     section = content
     for key in sections:
@@ -148,7 +148,7 @@ def test_the_case_itself_runs(good: dict[str, Any], tmp_path: Path) -> None:
     assert main(['simulate', str(case), '-o', str(tmp_path / 'out.csv')]) == 0
 
 
-def test_rest_is_what_is_left_out(good: dict[str, Any], tmp_path: Path) -> None:
+def test_missing_motion_is_rest(good: dict[str, Any], tmp_path: Path) -> None:
     del good['initial']['link_rates'], good['initial']['flywheel_speeds_absolute']
     case = tmp_path / 'case.json'
     case.write_text(json.dumps(good))
@@ -221,7 +221,7 @@ def test_wrong_mechanism(
 def test_angles_that_do_not_close(good: dict[str, Any], refused: Callable[..., str]) -> None:
     message = refused(changed(good, 'initial.link_angles', [0.0, 1.0, 0.0, 1.1]))
     assert 'do not close the loop' in message
-    # The far ends of b and d, 0.1 m each, are 0.1 rad apart.
+    # The ends of links b and d, 0.1 m each, are 0.1 rad apart.
     assert 'gap 0.009996 m' in message or 'gap 0.01 m' in message
 
 
@@ -258,7 +258,7 @@ PAPER_SECOND = ('simulate', '--closed-loop', 'paper', '--duration', '1')
 
 
 def closed_loop(output: Path, *arguments: str) -> bytes:
-    """Run a second of the paper's scenario, and return the table."""
+    """Run a second of the scenario of the paper, and return the table."""
     assert main([*PAPER_SECOND, '-o', str(output), *arguments]) == 0
     return output.read_bytes()
 
@@ -283,7 +283,7 @@ def test_closed_loop_table_is_the_recorded_run(tmp_path: Path) -> None:
 
 
 def test_closed_loop_moves_the_mechanism_by_torques_for_the_model(tmp_path: Path) -> None:
-    """Nothing of the table changes until the first torque, which comes after arm_at."""
+    """The tables agree until the first torque, which follows arm_at."""
     config = share_directory() / 'config'
     text = (config / 'scenario_paper.yaml').read_text()
     (tmp_path / 'heavy.yaml').write_text(
@@ -322,7 +322,7 @@ def test_impossible_closed_loop(
     arguments: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """One line, and no file, not even where the run ends in its middle."""
+    """The command prints one line and writes no file, also if the run ends early."""
     monkeypatch.chdir(tmp_path)
     text = (share_directory() / 'config' / 'scenario_paper.yaml').read_text()
     Path('odd.yaml').write_text(text.replace('step: 5.0e-4', 'step: 3.0e-4'))

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""`fourbar study` as it is typed."""
+"""The command `fourbar study`."""
 
 from collections.abc import Callable, Iterable
 import csv
@@ -26,7 +26,7 @@ Stub = Callable[[Callable[[Progress], Result]], None]
 
 @pytest.fixture
 def stub(monkeypatch: pytest.MonkeyPatch) -> Stub:
-    """Return a function that puts a function in the place of the study `validation`."""
+    """Return a function that replaces the study `validation` by a function."""
     def replace(run: Callable[[Progress], Result]) -> None:
         module = type(sys)('stub')
         module.run = run  # type: ignore[attr-defined]
@@ -35,7 +35,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> Stub:
 
 
 def result(value: float) -> Result:
-    """Make a result with one check, kept up to 1 and not beyond."""
+    """Make a result with one check, which passes for values up to 1."""
     return Result([at_most('sum', value, 'rad', 1.0)], {'sum_rad': value}, 'One line.',
                   {'sum.csv': 'sum\n', 'sum.png': b'\x89PNG'}, ['no second line: no ink'])
 
@@ -44,7 +44,7 @@ def result(value: float) -> Result:
 def test_validation_passes_its_checks_and_writes_its_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """From end to end, with one reference motion."""
+    """Run the study with one reference motion."""
     for library in ('sympy', 'mujoco', 'matplotlib'):
         pytest.importorskip(library)
     monkeypatch.setattr(validation, 'REFERENCES', ('asymmetric',))
@@ -54,7 +54,7 @@ def test_validation_passes_its_checks_and_writes_its_files(
     folder = tmp_path / 'study_validation'
     assert sorted(path.name for path in folder.iterdir()) == [
         'validation.csv', 'validation.json', 'validation.png']
-    # The first command compiles, which it announces.
+    # The first command announces that it compiles.
     assert [line for line in err.splitlines() if not line.startswith('Compiling')] == []
     assert 'MISSED' not in out
 
@@ -78,10 +78,10 @@ def test_validation_passes_its_checks_and_writes_its_files(
         assert row['motion'] in out
 
 
-def test_consistency_is_the_same_whatever_the_number_of_processes(
+def test_consistency_does_not_depend_on_the_number_of_processes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Two kinds, three runs of 0.6 s each; too few for the limits, so that checks fail."""
+    """Two kinds with three runs of 0.6 s are too few for the limits, so checks fail."""
     pytest.importorskip('matplotlib')
     kinds = [replace(case, scenario=replace(case.scenario, duration=0.6))
              for case in consistency.cases() if case.name in ('matched', 'prototype')]
@@ -112,7 +112,7 @@ def test_consistency_is_the_same_whatever_the_number_of_processes(
 
 @pytest.mark.parametrize(('value', 'code', 'word'), [
     (1.0, 0, 'ok'), (2.0, 1, 'MISSED'), (math.nan, 1, 'MISSED')])
-def test_a_missed_check_is_exit_code_1(
+def test_failed_check_is_exit_code_1(
     value: float, code: int, word: str, stub: Stub, tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -123,7 +123,7 @@ def test_a_missed_check_is_exit_code_1(
     assert [check['passed'] for check in document['checks']] == [code == 0]
 
 
-def test_files_are_written_to_the_given_places(
+def test_files_are_written_to_the_given_paths(
     stub: Stub, tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
     stub(lambda progress: result(0.5))
@@ -146,11 +146,11 @@ def test_json_may_go_into_the_new_folder(stub: Stub, tmp_path: Path) -> None:
     assert (folder / 'a.json').read_bytes() == (folder / 'validation.json').read_bytes()
 
 
-def test_places_that_are_not_writable_are_refused_before_the_work(
+def test_paths_that_are_not_writable_are_refused_before_the_study(
     stub: Stub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The user of the tests may be root, so that `os.access` is replaced."""
+    """The test replaces `os.access`, because root may write everywhere."""
     def fail(progress: Progress) -> Result:
         raise AssertionError('it began to work')
 
@@ -172,7 +172,7 @@ def test_study_that_cannot_be_written_leaves_no_folder(
     stub: Stub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """As on a full disk."""
+    """The replaced function fails as on a full disk."""
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -183,7 +183,7 @@ def test_study_that_cannot_be_written_leaves_no_folder(
     assert not list(tmp_path.iterdir())
 
 
-def test_progress_does_not_change_what_it_shows(stub: Stub, tmp_path: Path) -> None:
+def test_progress_does_not_change_the_items(stub: Stub, tmp_path: Path) -> None:
     seen: list[Any] = []
 
     def run(progress: Progress) -> Result:
@@ -211,7 +211,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
     arguments: list[str], words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str], stub: Stub,
 ) -> None:
-    """The error is found before the work."""
+    """The command finds the error before it runs the study."""
     def fail(progress: Progress) -> Result:
         raise AssertionError('it began to work')
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The arming arming, every state against every event."""
+"""State machine of arming: every event in every state."""
 
 from collections.abc import Callable
 from typing import Any
@@ -29,7 +29,7 @@ WAYS = {
     STOPPED: ['arm', 'stop'],
     FAULT: ['arm', 'fail'],
 }
-# What follows each event, by the state before it.
+# State after each event, by the state before it.
 AFTER = {
     'arm': {DISARMED: ARMED, ARMED: ARMED, STOPPED: STOPPED, FAULT: FAULT},
     'arm despite a blocker': {
@@ -42,7 +42,7 @@ AFTER = {
 
 
 def arming_in(state: DeviceState) -> Arming:
-    """Bring a new arming into a state, through the events that lead there."""
+    """Bring a new state machine into a state by events."""
     arming = Arming()
     for event in WAYS[state]:
         EVENTS[event](arming)
@@ -53,13 +53,13 @@ def arming_in(state: DeviceState) -> Arming:
 
 @pytest.mark.parametrize('before', list(DeviceState), ids=lambda state: state.value)
 @pytest.mark.parametrize('event', list(EVENTS))
-def test_event_leads_where_the_table_says(event: str, before: DeviceState) -> None:
+def test_event_leads_to_the_state_of_the_table(event: str, before: DeviceState) -> None:
     arming = arming_in(before)
     EVENTS[event](arming)
     assert arming.state is AFTER[event][before]
     assert arming.armed is (arming.state is ARMED)
     if arming.state is before:
-        # Nothing happened: the first reason is the one worth knowing.
+        # The first reason is kept.
         assert (arming.reason, arming.since_ns) == ('old reason', 1)
     else:
         assert arming.reason != 'old reason'
@@ -77,7 +77,7 @@ def test_initial_state_is_disarmed() -> None:
     (STOPPED, [], ['emergency_stop', 'old reason', 'reset_emergency_stop']),
     (FAULT, [], ['fault', 'old reason', 'reset_emergency_stop']),
 ])
-def test_refusal_says_why(
+def test_refusal_has_the_reason(
         state: DeviceState, arming_blockers: list[str], needles: list[str]) -> None:
     armed, message = arming_in(state).arm(NOW, arming_blockers)
     assert not armed
@@ -86,12 +86,12 @@ def test_refusal_says_why(
 
 
 @pytest.mark.parametrize('state', [DISARMED, ARMED])
-def test_arming_tells_success(state: DeviceState) -> None:
+def test_arming_reports_success(state: DeviceState) -> None:
     assert arming_in(state).arm(NOW, [])[0]
 
 
 @pytest.mark.parametrize('state', list(DeviceState), ids=lambda state: state.value)
-def test_reset_always_succeeds_and_tells_what_it_released(state: DeviceState) -> None:
+def test_reset_always_succeeds_and_names_the_released_parts(state: DeviceState) -> None:
     released, message = arming_in(state).reset(NOW)
     assert released
     assert state.value in message
@@ -100,7 +100,7 @@ def test_reset_always_succeeds_and_tells_what_it_released(state: DeviceState) ->
 @settings(max_examples=300, derandomize=True)
 @given(events=st.lists(st.sampled_from(sorted(EVENTS)), max_size=30))
 def test_only_a_reset_and_then_arm_lead_from_a_latched_state_to_armed(events: list[str]) -> None:
-    """Whatever happens, `armed` is entered from `disarmed` alone, and only when asked."""
+    """After any events, only the event `arm` leads from `disarmed` to `armed`."""
     arming = Arming()
     for event in events:
         before = arming.state

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A wheel command is taken whole or rejected whole."""
+"""A wheel command is accepted or rejected as a whole."""
 
 from itertools import permutations
 from math import inf, nan
@@ -36,7 +36,7 @@ def test_names_may_come_in_any_order(order: tuple[int, ...]) -> None:
 
 @settings(derandomize=True)
 @given(given_torques=st.dictionaries(st.sampled_from(FLYWHEEL_NAMES), finite, min_size=1))
-def test_wheel_that_is_not_named_has_no_power(given_torques: dict[str, float]) -> None:
+def test_wheel_missing_in_a_command_has_no_power(given_torques: dict[str, float]) -> None:
     drive = drive_by_name(list(given_torques), [], [], list(given_torques.values()))
     assert drive.values.tolist() == [given_torques.get(name, 0.0) for name in FLYWHEEL_NAMES]
     assert not drive.by_speed.any()
@@ -45,7 +45,7 @@ def test_wheel_that_is_not_named_has_no_power(given_torques: dict[str, float]) -
 
 @settings(derandomize=True)
 @given(speeds=st.dictionaries(st.sampled_from(FLYWHEEL_NAMES), finite, min_size=1))
-def test_wheel_whose_speed_is_not_named_coasts(speeds: dict[str, float]) -> None:
+def test_wheel_missing_in_a_speed_command_coasts(speeds: dict[str, float]) -> None:
     drive = drive_by_name(list(speeds), [], list(speeds.values()), [])
     assert drive.values.tolist() == [speeds.get(name, 0.0) for name in FLYWHEEL_NAMES]
     assert drive.by_speed.tolist() == [name in speeds for name in FLYWHEEL_NAMES]
@@ -88,7 +88,7 @@ def test_effort_must_be_finite(wheel: str, value: float) -> None:
 @pytest.mark.parametrize(('efforts', 'others'), [
     ([1.0], {'positions': [0.0]}), ([], {'positions': [0.0]}), ([1.0], {'velocities': [0.0]}),
     ([], {'positions': [0.0], 'velocities': [0.0]})])
-def test_effort_or_velocity_is_taken_and_nothing_else(
+def test_command_has_either_effort_or_velocity(
     efforts: list[float], others: dict[str, list[float]],
 ) -> None:
     assert rejected([A], efforts, **others).kind == 'fields'

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What helps a tick without an answer: nothing, sending it again, or going on."""
+"""Recovery of a tick without an answer: wait, send it again, or give up."""
 
 from fourbar_ros.device import LockstepClock, LockstepGuard, Participants, Recovery
 
@@ -13,7 +13,7 @@ ALL = Participants(1, 1, 1, 1, 1)
 
 
 def waiting() -> tuple[LockstepClock, LockstepGuard, int]:
-    """Return a lock-step whose first tick just went out to all, its guard and the time."""
+    """Return a lock-step clock whose first tick has just been sent, its guard and the time."""
     clock = LockstepClock(PERIOD)
     guard = LockstepGuard(clock, TIMEOUT, SETTLE)
     guard.update(ALL, 0)
@@ -22,7 +22,7 @@ def waiting() -> tuple[LockstepClock, LockstepGuard, int]:
     return clock, guard, SETTLE
 
 
-def test_tick_is_sent_again_after_the_timeout_at_intervals_that_grow() -> None:
+def test_tick_is_repeated_after_the_timeout_at_growing_intervals() -> None:
     _, guard, start = waiting()
     step = TIMEOUT // 20
     times = [n * step for n in range(20 * 60)
@@ -31,24 +31,24 @@ def test_tick_is_sent_again_after_the_timeout_at_intervals_that_grow() -> None:
     assert times[0] == TIMEOUT + step
     assert intervals == sorted(intervals)
     assert intervals[1] >= TIMEOUT
-    # Soon enough after a long stop that a person would still wait for it.
+    # The longest interval limits the delay after a long stop.
     assert intervals[-1] <= 10 * TIMEOUT + step
 
 
-def test_link_angles_go_out_again_only_if_the_estimator_said_nothing() -> None:
+def test_link_angles_are_repeated_only_without_an_estimate() -> None:
     for estimate, recovery in ((None, Recovery.SEND_ALL), (FIRST - PERIOD, Recovery.SEND_ALL),
                                (FIRST, Recovery.SEND_TICK)):
         _, guard, start = waiting()
         assert guard.recovery(estimate, start + TIMEOUT + 1) is recovery
 
 
-def test_answered_tick_needs_no_help() -> None:
+def test_answered_tick_is_not_repeated() -> None:
     clock, guard, start = waiting()
     assert clock.answered(FIRST)
     assert guard.recovery(FIRST, start + 100 * TIMEOUT) is Recovery.NOTHING
 
 
-def test_every_tick_has_its_own_patience() -> None:
+def test_every_tick_has_its_own_timeout() -> None:
     clock, guard, now = waiting()
     for _ in range(3):
         assert guard.recovery(None, now + TIMEOUT) is Recovery.NOTHING
@@ -58,13 +58,13 @@ def test_every_tick_has_its_own_patience() -> None:
         assert clock.due(now) is not None
 
 
-def test_nothing_is_sent_to_nobody() -> None:
+def test_tick_is_not_repeated_without_participants() -> None:
     _, guard, start = waiting()
     guard.update(Participants(1, 1, 0, 1, 0), start + 1)
     assert guard.recovery(None, start + 5 * TIMEOUT) is Recovery.NOTHING
 
 
-def test_tick_that_went_out_before_somebody_joined_is_given_up() -> None:
+def test_tick_is_given_up_after_a_participant_joins() -> None:
     _, guard, start = waiting()
     guard.update(Participants(1, 1, 0, 1, 0), start + 1)
     guard.update(ALL, start + 2 * TIMEOUT)

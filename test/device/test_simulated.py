@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The simulated table as a device: when its sensors speak, and what its faults do."""
+"""The simulated table as a device: timing of its samples, and effects of its faults."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PUSH = np.array([2e-3, -1e-3, 1.5e-3, 3e-3])
 
 @pytest.fixture(scope='module')
 def ideal() -> Mechanism:
-    """Take the linkage of the prototype, its motors without lag or windings."""
+    """Return the linkage of the prototype with motors without lag and windings."""
     return replace(
         load_mechanism('prototype'), motor_time_constants=np.zeros(4),
         motor_torque_constants=np.full(4, np.inf), motor_resistances=np.zeros(4),
@@ -47,7 +47,7 @@ def ideal() -> Mechanism:
 
 @pytest.fixture(scope='module')
 def make(ideal: Mechanism) -> Make:
-    """Return a function that makes a table without errors but those that are given."""
+    """Return a function that makes a table without errors except for given ones."""
     def made(period_ns: int = PERIOD_NS, initial: InitialState | None = None,
              **sensors: object) -> SimulatedTable:
         table = Table(LinkSensorSettings(**sensors), WheelEncoders(0))  # type: ignore[arg-type]
@@ -70,7 +70,7 @@ def truths(make: Make) -> dict[int, Array]:
 
 
 def assert_true(samples: list[Samples], truth: dict[int, Array]) -> None:
-    """Every sample tells the truth of its stamp, whenever it comes."""
+    """Check that every sample is the true value at its stamp."""
     for sample in samples:
         for reading in sample.links:
             np.testing.assert_allclose(
@@ -78,7 +78,7 @@ def assert_true(samples: list[Samples], truth: dict[int, Array]) -> None:
 
 
 @pytest.mark.parametrize(('latency_ms', 'ticks_later'), [(0, 0), (1, 1), (4, 1), (5, 2), (8, 2)])
-def test_sample_comes_with_the_first_tick_after_its_latency(
+def test_sample_arrives_at_the_first_tick_after_its_latency(
     latency_ms: int, ticks_later: int, make: Make,
 ) -> None:
     samples = run(make(latency=latency_ms * 1e-3), 30)
@@ -91,10 +91,10 @@ def test_sample_comes_with_the_first_tick_after_its_latency(
 @pytest.mark.parametrize(('rate', 'first_offsets_ms'), [
     (1000.0, [[0], [1, 2, 3, 4], [5, 6, 7, 8]]), (500.0, [[0], [2, 4], [6, 8]]),
     (125.0, [[0], [], [8], []]), (250.0, [[0], [4], [8]])])
-def test_sensors_keep_their_own_rate(
+def test_sensors_have_their_own_rate(
     rate: float, first_offsets_ms: list[list[int]], make: Make,
 ) -> None:
-    """Faster than ticks, as fast, or slower: stamps are those of the measurement."""
+    """The rate is above, at and below the rate of ticks; stamps are times of measurement."""
     samples = run(make(rate=rate), 40)
     assert_true(samples, truths(make))
     offsets = [[(reading.stamp_ns - FIRST_NS) // MS for reading in sample.links]
@@ -103,7 +103,7 @@ def test_sensors_keep_their_own_rate(
     assert sum(map(len, offsets)) == 1 + int(rate * 39 * 4e-3 + 1e-9)
 
 
-def test_joint_sensors_tell_relative_angles_and_one_heading(make: Make) -> None:
+def test_joint_sensors_measure_relative_angles_and_one_heading(make: Make) -> None:
     table = make(kind='joint', heading='link_c')
     assert table.sensor_names == ('joint_1', 'joint_2', 'joint_3', 'joint_4', 'link_c')
     for sample in run(table, 5):
@@ -115,7 +115,7 @@ def test_joint_sensors_tell_relative_angles_and_one_heading(make: Make) -> None:
 
 
 def gains(table: SimulatedTable, ticks: int = 25, torques: Array = PUSH) -> Array:
-    """Return how fast wheels of a table at rest turn after some ticks (4,), recoil included."""
+    """Return the speeds of initially resting wheels after some ticks, with the recoil (4,)."""
     *_, last = run(table, ticks + 1, torques)
     assert last.truth is not None
     return last.truth.wheel_speeds + last.truth.link_rates
@@ -130,7 +130,7 @@ def test_weak_motor_gives_a_share_of_its_torque(text: str, share: float, make: M
     np.testing.assert_allclose(gains(table), shares * PUSH / 1.2e-4 * 0.1, rtol=1e-9)
 
 
-def test_runaway_turns_by_itself_at_most_by_its_limit(make: Make) -> None:
+def test_runaway_torque_is_at_most_the_limit(make: Make) -> None:
     for torque, expected in ((3e-3, 3e-3), (-10.0, -0.05)):
         table = make(initial=InitialState())
         table.break_down('flywheel_d', Fault('flywheel_d', 'runaway', torque))
@@ -141,7 +141,7 @@ def test_runaway_turns_by_itself_at_most_by_its_limit(make: Make) -> None:
 
 @pytest.mark.parametrize(('kind', 'cut'), [('runaway', True), ('shorted', False)])
 def test_power_of_one_wheel_is_cut_and_comes_back(kind: str, cut: bool, make: Make) -> None:
-    """With the tick, a runaway as well as what is asked for, but no short."""
+    """Without power, commands and a runaway give no torque; a short circuit does."""
     table = make()
     table.break_down('flywheel_d', Fault('flywheel_d', kind, 4e-3))
     rng = np.random.default_rng(7)
@@ -155,7 +155,7 @@ def test_power_of_one_wheel_is_cut_and_comes_back(kind: str, cut: bool, make: Ma
             sample.wheels.efforts, expected, rtol=1e-12, err_msg=f'seed 7, tick {n}')
 
 
-def test_stuck_wheel_turns_with_its_link_up_to_the_torque_of_the_brake(make: Make) -> None:
+def test_stuck_wheel_turns_with_its_link_up_to_the_fault_torque(make: Make) -> None:
     table = make(initial=InitialState())
     table.break_down('flywheel_a', Fault('flywheel_a', 'stuck', 5e-3))
     for torque, sticks in ((4e-3, True), (6e-3, False)):
@@ -165,7 +165,7 @@ def test_stuck_wheel_turns_with_its_link_up_to_the_torque_of_the_brake(make: Mak
         assert last.wheels.efforts[0] == pytest.approx(torque)
 
 
-def test_dragging_wheel_loses_what_it_drags(make: Make) -> None:
+def test_torque_of_a_dragging_wheel_is_reduced_by_the_drag(make: Make) -> None:
     table = make(initial=InitialState())
     table.break_down('flywheel_c', Fault('flywheel_c', 'dragging', 5e-4))
     expected = (PUSH - [0.0, 0.0, 5e-4, 0.0]) / 1.2e-4 * 0.1
@@ -173,8 +173,8 @@ def test_dragging_wheel_loses_what_it_drags(make: Make) -> None:
 
 
 @pytest.mark.parametrize('delay_ms', [0.5, 4.0, 10.0, 50.0])
-def test_delayed_motor_does_what_was_asked_before(delay_ms: float, make: Make) -> None:
-    """Torque that changes every tick, to the step of 0.5 ms; earlier there was none."""
+def test_delayed_motor_follows_earlier_commands(delay_ms: float, make: Make) -> None:
+    """The command changes every tick; the delay is exact to the step of 0.5 ms."""
     table = make()
     delay = round(delay_ms / 0.5)
     table.break_down('flywheel_c', Fault('flywheel_c', 'delayed', delay_ms * 1e-3))
@@ -190,7 +190,7 @@ def test_delayed_motor_does_what_was_asked_before(delay_ms: float, make: Make) -
 
 @pytest.mark.parametrize('delay_ms', [0.5, 10.0, 50.0])
 def test_delayed_motor_is_cut_at_once(delay_ms: float, make: Make) -> None:
-    """Power comes back at once as well, to a motor that is late with its commands as before."""
+    """Power returns at once too, and the commands of the motor stay delayed."""
     table = make()
     delay = round(delay_ms / 0.5)
     table.break_down('flywheel_c', Fault('flywheel_c', 'delayed', delay_ms * 1e-3))
@@ -208,8 +208,8 @@ def test_delayed_motor_is_cut_at_once(delay_ms: float, make: Make) -> None:
                                    err_msg=f'seed 5, period {n}')
 
 
-def test_delay_that_comes_later_goes_back_in_time(make: Make) -> None:
-    """The motor repeats what it has done already."""
+def test_delay_fault_during_a_run_repeats_earlier_commands(make: Make) -> None:
+    """The motor follows again commands that it has already followed."""
     table = make()
     asked = np.arange(1.0, 41.0)[:, None] * 1e-4 * np.ones(4)
     for n, torques in enumerate(asked):
@@ -233,7 +233,7 @@ def test_speed_commands_reach_the_motors(make: Make) -> None:
 
 
 def test_wheel_that_follows_a_speed_coasts_while_it_is_cut(make: Make) -> None:
-    """And is followed again, from wherever it is then."""
+    """With power again the speed loop starts from the present speed."""
     table = make(initial=InitialState())
     wanted, only_b = np.array([20.0, 0.0, 0.0, -10.0]), np.array([False, True, False, False])
     for n in range(300):
@@ -246,7 +246,7 @@ def test_wheel_that_follows_a_speed_coasts_while_it_is_cut(make: Make) -> None:
     np.testing.assert_allclose(sample.truth.wheel_speeds, wanted, atol=1e-2)
 
 
-def test_scheduled_faults_come_and_go_on_time(make: Make) -> None:
+def test_scheduled_faults_begin_and_end_on_time(make: Make) -> None:
     table = make(initial=InitialState())
     table.schedule_faults([
         {'at': 0.04, 'until': 0.08, 'target': 'link_b', 'fault': 'off'},
@@ -254,7 +254,7 @@ def test_scheduled_faults_come_and_go_on_time(make: Make) -> None:
     for n, sample in enumerate(run(table, 40)):
         missing = 'link_b' not in sample.links[0].names
         assert missing is (10 <= n < 20), f'tick {n}'
-        # A fault of the tick acts on the period that begins with it.
+        # A fault at a tick acts on the period that begins with this tick.
         assert bool(sample.wheels.efforts[0] == 0.0) is (n == 0 or n > 15), f'tick {n}'
     with pytest.raises(FaultError) as caught:
         table.schedule_faults(
@@ -263,14 +263,14 @@ def test_scheduled_faults_come_and_go_on_time(make: Make) -> None:
 
 
 @pytest.mark.parametrize('target', ['joint_1', 'flywheel_e', 'link_x'])
-def test_what_is_not_there_cannot_break(target: str, make: Make) -> None:
+def test_fault_of_an_unknown_target_is_refused(target: str, make: Make) -> None:
     table = make()
     with pytest.raises(FaultError) as caught:
         table.break_down(target, None)
     assert target in str(caught.value)
 
 
-def test_reset_puts_the_linkage_and_leaves_time_and_faults(make: Make) -> None:
+def test_reset_sets_the_state_and_keeps_time_and_faults(make: Make) -> None:
     table = make()
     table.break_down('link_a', Fault('link_a', 'off'))
     run(table, 10)
@@ -281,8 +281,8 @@ def test_reset_puts_the_linkage_and_leaves_time_and_faults(make: Make) -> None:
     np.testing.assert_allclose(sample.wheels.speeds, 0.0, atol=1e-9)
 
 
-def test_prototype_with_everything_on_repeats_itself_to_the_byte() -> None:
-    """Same seed, same bytes; another seed, others."""
+def test_prototype_with_all_effects_is_reproducible() -> None:
+    """The same seed gives the same bytes, another seed gives others."""
     def record(seed: int) -> bytes:
         table = SimulatedTable(Plant(
             load_mechanism('prototype'), load_table('prototype'), InitialState(), 5e-4,

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Torque reaches the wheels only while armed, within limits, and only as long as commands come."""
+"""Supervisor: commands, arming, timeouts, limits, faults and timing."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -55,7 +55,7 @@ def test_accepted_command_drives_from_the_next_step_on(operate: Operate) -> None
     assert bed.powered == [True, False, False, False]
 
 
-def test_command_of_zero_torque_powers_the_wheels_that_it_names(operate: Operate) -> None:
+def test_command_of_zero_torque_powers_the_named_wheels(operate: Operate) -> None:
     bed = operate()
     bed.tick()
     assert bed.powered == OFF
@@ -64,7 +64,7 @@ def test_command_of_zero_torque_powers_the_wheels_that_it_names(operate: Operate
     assert bed.powered == [False, True, False, True]
 
 
-def test_more_than_a_motor_has_is_clipped_and_counted(operate: Operate) -> None:
+def test_torque_beyond_the_limit_is_clipped_and_counted(operate: Operate) -> None:
     bed = operate()
     bed.command(1.0, -1.0, LIMIT, -LIMIT / 2)
     bed.tick()
@@ -82,7 +82,7 @@ def test_more_than_a_motor_has_is_clipped_and_counted(operate: Operate) -> None:
     ('finite', (['flywheel_b', 'flywheel_a'], [], [], [0.0, nan])),
     ('fields', (['flywheel_a'], [], [1.0], [0.0])),
 ])
-def test_rejected_command_changes_nothing_but_its_counter(
+def test_rejected_command_changes_only_its_counter(
     kind: str, fields: tuple[Any, ...], operate: Operate,
 ) -> None:
     bed = operate()
@@ -139,7 +139,7 @@ def test_command_before_the_first_tick_is_rejected(operate: Operate) -> None:
 
 # Arming
 
-def test_old_torque_does_not_come_back_with_arming(operate: Operate) -> None:
+def test_arming_does_not_restore_the_old_torque(operate: Operate) -> None:
     bed = operate(armed=False)
     bed.tick()
     bed.command(1e-5)
@@ -163,7 +163,7 @@ def test_arming_needs_every_link_sensor(silent: tuple[int, ...], operate: Operat
     bed = operate(armed=False)
     bed.tick()
     bed.device.links = tuple(link for link in range(4) if link not in silent)
-    # 0.2 s of 4 ms are 50 periods.
+    # The samples expire after 0.2 s, which is 50 periods.
     for _ in range(50):
         bed.tick()
     assert bed.arm()[0]
@@ -229,9 +229,9 @@ def test_failing_device_latches_a_fault(operate: Operate) -> None:
     assert bed.driven == NONE
 
 
-# What the device learns between steps, and what it finds
+# Calls of the device between steps, and its faults
 
-def test_device_learns_of_commands_at_once_and_only_while_armed(operate: Operate) -> None:
+def test_commands_are_sent_to_the_device_at_once_and_only_while_armed(operate: Operate) -> None:
     bed = operate(armed=False)
     bed.tick()
     bed.command(1e-5)
@@ -244,7 +244,7 @@ def test_device_learns_of_commands_at_once_and_only_while_armed(operate: Operate
 
 
 @pytest.mark.parametrize('way', ['disarm', 'emergency_stop', 'watchdog', 'close'])
-def test_device_learns_at_once_that_it_has_no_power(way: str, operate: Operate) -> None:
+def test_loss_of_power_is_sent_to_the_device_at_once(way: str, operate: Operate) -> None:
     bed = operate()
     bed.command(1e-5)
     bed.device.drives.clear()
@@ -270,7 +270,7 @@ def test_every_change_of_arming_is_sent_to_the_device_once(operate: Operate) -> 
                                  DeviceState.DISARMED, DeviceState.ARMED]
 
 
-def test_reset_releases_what_the_device_holds_by_itself_but_never_while_armed(
+def test_reset_releases_stopped_parts_of_the_device_and_never_while_armed(
     operate: Operate,
 ) -> None:
     bed = operate()
@@ -285,7 +285,7 @@ def test_reset_releases_what_the_device_holds_by_itself_but_never_while_armed(
     assert bed.device.releases == 3
 
 
-def test_device_that_fails_to_take_a_command_latches_a_fault(operate: Operate) -> None:
+def test_device_error_during_a_command_latches_a_fault(operate: Operate) -> None:
     bed = operate()
     bed.device.breaks = True
     bed.command(1e-5)
@@ -296,7 +296,7 @@ def test_device_that_fails_to_take_a_command_latches_a_fault(operate: Operate) -
 @pytest.mark.parametrize(('reaction', 'state'), [
     (Reaction.WARN, DeviceState.ARMED), (Reaction.COAST, DeviceState.DISARMED),
     (Reaction.STOP, DeviceState.EMERGENCY_STOP)])
-def test_finding_has_its_consequence(
+def test_fault_of_the_device_has_its_reaction(
     reaction: Reaction, state: DeviceState, operate: Operate,
 ) -> None:
     bed = operate()
@@ -311,7 +311,7 @@ def test_finding_has_its_consequence(
         [True, False, False, False] if state is DeviceState.ARMED else OFF)
 
 
-def test_what_the_device_knows_to_be_blockers_keeps_it_from_being_armed(
+def test_arming_blockers_of_the_device_prevent_arming(
     operate: Operate,
 ) -> None:
     bed = operate(armed=False)
@@ -320,7 +320,7 @@ def test_what_the_device_knows_to_be_blockers_keeps_it_from_being_armed(
     assert bed.arm() == (False, 'refused: link_c: no heartbeat')
 
 
-def test_step_without_all_wheels_is_no_tick_that_anybody_could_answer(operate: Operate) -> None:
+def test_step_without_all_wheels_is_no_tick(operate: Operate) -> None:
     bed = operate()
     bed.command(1e-5)
     answered_ns = bed.stamp_ns
@@ -335,12 +335,12 @@ def test_step_without_all_wheels_is_no_tick_that_anybody_could_answer(operate: O
         answered_ns, ['flywheel_a'], [], [], [2e-5], bed.monotonic_ns)
 
 
-# Watchdog
+# Command timeout
 
-def test_watchdog_disarms_after_the_timeout(operate: Operate) -> None:
+def test_device_is_disarmed_after_the_command_timeout(operate: Operate) -> None:
     bed = operate()
     bed.command(1e-5)
-    # The command holds for 0.1 s: 25 periods of 4 ms, and not one more.
+    # The command is valid for 0.1 s, which is 25 periods of 4 ms.
     for _ in range(25):
         bed.tick()
         assert bed.driven[0] == 1e-5
@@ -355,10 +355,10 @@ def test_watchdog_disarms_after_the_timeout(operate: Operate) -> None:
 
 @pytest.mark.parametrize(('action', 'powered'), [
     ('coast', False), ('hold_speed', True), ('brake', True)])
-def test_wheels_keep_their_power_only_where_the_watchdog_parks_them(
+def test_wheels_keep_their_power_after_a_timeout_only_if_parked(
     action: str, powered: bool, operate: Operate,
 ) -> None:
-    """All of them, whichever the last command named."""
+    """All wheels are parked, also those missing in the last command."""
     bed = operate(timeout_action=action)
     bed.command(1e-5)
     for _ in range(25):
@@ -373,7 +373,7 @@ def test_wheels_keep_their_power_only_where_the_watchdog_parks_them(
     assert bed.powered == OFF
 
 
-def test_watchdog_waits_as_long_for_the_first_command(operate: Operate) -> None:
+def test_timeout_of_the_first_command_is_the_same(operate: Operate) -> None:
     bed = operate()
     for _ in range(25):
         bed.tick()
@@ -382,7 +382,7 @@ def test_watchdog_waits_as_long_for_the_first_command(operate: Operate) -> None:
     assert not bed.supervisor.arming.armed
 
 
-def test_commands_in_time_keep_it_armed(operate: Operate) -> None:
+def test_commands_in_time_keep_the_device_armed(operate: Operate) -> None:
     bed = operate()
     for _ in range(200):
         bed.command(1e-5)
@@ -390,21 +390,21 @@ def test_commands_in_time_keep_it_armed(operate: Operate) -> None:
     assert bed.supervisor.arming.armed
 
 
-def test_frozen_stamps_do_not_disable_the_watchdog(operate: Operate) -> None:
+def test_command_timeout_acts_with_frozen_stamps(operate: Operate) -> None:
     bed = operate()
     for _ in range(26):
         bed.tick(periods=1e-6, monotonic=1.0)
     assert not bed.supervisor.arming.armed
 
 
-def test_stamps_that_run_away_do_not_trip_the_watchdog(operate: Operate) -> None:
+def test_command_timeout_does_not_depend_on_fast_stamps(operate: Operate) -> None:
     bed = operate()
     for _ in range(25):
         bed.tick(periods=1000.0, monotonic=1.0)
     assert bed.supervisor.arming.armed
 
 
-def test_rejected_commands_do_not_feed_the_watchdog(operate: Operate) -> None:
+def test_rejected_commands_do_not_restart_the_timeout(operate: Operate) -> None:
     bed = operate()
     for _ in range(26):
         bed.tick()
@@ -416,7 +416,7 @@ def test_rejected_commands_do_not_feed_the_watchdog(operate: Operate) -> None:
 
 @pytest.fixture(scope='module')
 def uneven() -> Mechanism:
-    """Make a linkage whose link rates change when it moves freely."""
+    """Make a linkage whose link rates vary in free motion."""
     return Mechanism(  # type: ignore[arg-type]
         [0.12, 0.08, 0.11, 0.10], [0.02, 0.03, 0.025, 0.018], [2.2e-5, 1.5e-5, 3e-5, 1.8e-5],
         [[0.05, 0.01], [0.04, -0.01], [0.06, 0.005], [0.05, 0.0]], [3e-7, 4e-7, 5e-7, 2e-7],
@@ -425,9 +425,9 @@ def uneven() -> Mechanism:
 
 def left_alone(mechanism: Mechanism, action: str) -> tuple[list[Any], DeviceSupervisor]:
     """
-    Spin up the wheels of a moving linkage, then stop commanding.
+    Spin up the wheels of a moving linkage, then stop the commands.
 
-    :returns: ground truth of every tick since the watchdog's, 1 s.
+    :returns: ground truth of the ticks of 1 s after the timeout, and the supervisor.
     """
     plant = Plant(mechanism, Table(LinkSensorSettings(), WheelEncoders(0)),
                   InitialState(0.3, 1.6, 'open', 1.0, 0.6), 5e-4, np.random.default_rng(0))
@@ -440,7 +440,7 @@ def left_alone(mechanism: Mechanism, action: str) -> tuple[list[Any], DeviceSupe
         if n == 0:
             assert testbed.arm(now, [])[0]
         if n < 40:
-            # The last command lets them coast, so that they are steady when the watchdog comes.
+            # The last command is zero, so the absolute speeds are constant at the timeout.
             drive = [4e-5, -3e-5] if n < 39 else [0.0, 0.0]
             testbed.command(now, ['flywheel_a', 'flywheel_c'], [], [], drive, now)
         if not testbed.arming.armed and n:
@@ -461,15 +461,15 @@ def test_coasting_wheels_keep_their_momentum(uneven: Mechanism) -> None:
     assert not any(truth.efforts.any() for truth in truths)
 
 
-def test_hold_speed_keeps_the_wheels_on_links_that_change_theirs(uneven: Mechanism) -> None:
+def test_hold_speed_keeps_wheel_speeds_on_links_with_varying_rates(uneven: Mechanism) -> None:
     truths, testbed = left_alone(uneven, 'hold_speed')
     speeds = np.array([truth.wheel_speeds for truth in truths])
     rates = np.array([truth.link_rates for truth in truths])
-    # The loop, two poles at 30 rad/s, follows an acceleration that changes slowly with less
-    # error than a proportional one of its bandwidth of 60 rad/s: acceleration / 60.
+    # The loop with two poles at 30 rad/s has a smaller error for slow accelerations than a
+    # proportional loop with a bandwidth of 60 rad/s, whose error is acceleration / 60.
     bound = np.abs(np.diff(rates, axis=0)).max() / 4e-3 / 60.0
     assert np.abs(speeds - speeds[0]).max() < bound
-    # Without the loop they would stray by what the links do.
+    # Without the loop the wheel speeds would vary as the link rates do.
     assert np.abs(rates - rates[0]).max() > 5.0 * bound
     assert testbed.arming.state is DeviceState.DISARMED
     assert momentum(uneven, truths[-1]) == pytest.approx(momentum(uneven, truths[0]), rel=1e-11)
@@ -481,17 +481,17 @@ def test_brake_brings_the_wheels_to_rest(uneven: Mechanism) -> None:
                     link_masses=np.full(4, 0.02), link_inertias=np.full(4, 2.2e-5))
     truths, testbed = left_alone(still, 'brake')
     speeds = np.array([truth.wheel_speeds for truth in truths])
-    # At 2e-7 kg m^2 and more, 1e-4 N m takes some 20 rad/s away in 0.1 s; the rest, 0.9 s, goes
-    # with at least 20 of the loop's 30 rad/s. A rhombus keeps its link rates, so nothing is left.
+    # With 2e-7 kg m^2 or more, 1e-4 N m reduces the speed by 20 rad/s in 0.1 s. In the other
+    # 0.9 s the speed decays at 20 /s or more; the loop has 30 /s. A rhombus has constant rates.
     assert np.abs(speeds[0]).max() > 10.0
     assert np.abs(speeds[-1]).max() < np.abs(speeds[0]).max() * exp(-20.0 * 0.9)
     assert testbed.arming.state is DeviceState.DISARMED
-    # All of their momentum is in the links now.
+    # The links have all momentum.
     assert momentum(still, truths[-1]) == pytest.approx(momentum(still, truths[0]), rel=1e-11)
 
 
 @pytest.mark.parametrize('way', ['disarm', 'emergency_stop', 'fault', 'fault, then reset', 'arm'])
-def test_parking_ends_with_whatever_comes_next(way: str, operate: Operate) -> None:
+def test_parking_ends_with_any_request(way: str, operate: Operate) -> None:
     bed = operate(timeout_action='brake')
     for _ in range(30):
         bed.tick()
@@ -522,7 +522,7 @@ def test_parking_respects_the_torque_limit(operate: Operate) -> None:
     assert np.abs(bed.driven).max() == LIMIT
 
 
-# Whatever happens
+# Random sequences
 
 ticks = st.tuples(st.just('tick'), st.sampled_from([1.0, 1.0, 30.0]))
 commands = st.tuples(st.just('command'), st.lists(
@@ -541,9 +541,9 @@ def test_wheels_are_driven_only_when_allowed_and_within_limits(
     action: str, events: list[tuple[str, Any]], operate: Operate,
 ) -> None:
     """
-    Torque passes only while armed, or parking after the watchdog, and never beyond the limits.
+    Check that wheels have torque only while armed or parked, and within the limits.
 
-    Armed it has power where the last command since then names the wheel, parking everywhere.
+    An armed device powers the wheels of the last command since arming, a parked one all wheels.
     """
     bed = operate(timeout_action=action)
     arming = bed.supervisor.arming
@@ -591,14 +591,14 @@ def test_wheels_are_driven_only_when_allowed_and_within_limits(
 
 # Timing
 
-def test_nothing_is_known_before_the_first_answer(operate: Operate) -> None:
+def test_timing_is_unknown_before_the_first_answer(operate: Operate) -> None:
     bed = operate(armed=False)
     for _ in range(3):
         _, timing = bed.tick()
         assert (timing.round_trip_s, timing.command_age_s, timing.lost) == (None, None, 0)
 
 
-def test_round_trip_and_age_are_on_the_steady_clock(operate: Operate) -> None:
+def test_round_trip_and_age_are_on_the_monotonic_clock(operate: Operate) -> None:
     bed = operate()
     bed.tick()
     bed.monotonic_ns += 700_000
@@ -630,7 +630,7 @@ def test_only_the_first_answer_counts_as_the_round_trip(operate: Operate) -> Non
 def test_ticks_without_an_answer_within_one_period_are_lost(
     delays: list[int | None], operate: Operate,
 ) -> None:
-    """The first tick is answered at once, the others after delays [ns] or never (None)."""
+    """The first tick is answered at once, the others after a delay [ns] or never (None)."""
     bed = operate()
     answers = [(n * PERIOD_NS + delay, n) for n, delay in enumerate([0, *delays])
                if delay is not None]
@@ -645,11 +645,11 @@ def test_ticks_without_an_answer_within_one_period_are_lost(
                 try:
                     bed.command(0.0, ahead_ns=first + answered * PERIOD_NS - bed.stamp_ns)
                 except RejectedError:
-                    # An answer that was overtaken by a newer one, so more than a period late.
+                    # A newer answer has arrived, so this one is more than a period late.
                     pass
         bed.monotonic_ns = start + n * PERIOD_NS
         if n == len(delays) + 3:
-            # The ticks after the last delay wait for an answer still: two are overdue.
+            # The ticks after the last delay have no answer yet; one of them counts as lost.
             late = sum(delay is None or delay > PERIOD_NS for delay in delays)
             assert timing.lost == late + 1
 
@@ -674,13 +674,13 @@ def test_wheel_speeds_are_what_the_encoders_moved(paper: Mechanism) -> None:
     table = SimulatedTable(plant, PERIOD_NS)
     before = table.step(0, Drive(np.zeros(4), NO_SPEED, ALL))
     for n in range(1, 20):
-        # Every third tick comes two periods late.
+        # Every third tick is two periods late.
         stamp = before.stamp_ns + PERIOD_NS * (3 if n % 3 == 0 else 1)
         now = table.step(stamp, Drive(np.full(4, 5e-5), NO_SPEED, ALL))
         moved = (now.wheels.angles - before.wheels.angles) / ((stamp - before.stamp_ns) * 1e-9)
         np.testing.assert_allclose(now.wheels.speeds, moved, rtol=1e-12)
         before = now
-    # 5e-5 N m all along: time has passed for the wheels as for the stamps.
+    # The torque is constant, so the speeds show the elapsed time.
     expected = 5e-5 / paper.flywheel_inertias * before.stamp_ns * 1e-9
     truth = before.truth
     assert truth is not None
@@ -688,10 +688,10 @@ def test_wheel_speeds_are_what_the_encoders_moved(paper: Mechanism) -> None:
 
 
 @pytest.mark.parametrize(('kind', 'cut'), [('runaway', True), ('shorted', False)])
-def test_what_gives_torque_by_itself_while_disarmed(
+def test_torque_of_faulty_motors_while_disarmed(
     kind: str, cut: bool, paper: Mechanism,
 ) -> None:
-    """A runaway needs power, a short does not; both push while the wheel is powered."""
+    """A runaway needs power and a short circuit does not."""
     plant = Plant(paper, Table(LinkSensorSettings(), WheelEncoders(0)), InitialState(), 5e-4,
                   np.random.default_rng(0))
     table = SimulatedTable(plant, PERIOD_NS)
@@ -700,7 +700,7 @@ def test_what_gives_torque_by_itself_while_disarmed(
     now = 0
 
     def efforts(wheels: str = '') -> list[float]:
-        """Command some wheels, or none, and return what acts then."""
+        """Command some wheels or none, and return the efforts."""
         nonlocal now
         if wheels:
             names = [f'flywheel_{letter}' for letter in wheels]
@@ -735,8 +735,8 @@ def test_period_that_is_no_multiple_of_the_step_is_refused(paper: Mechanism) -> 
     assert '0.0003' in str(caught.value)
 
 
-def test_late_answer_counts_once_as_lost_and_tells_its_round_trip(operate: Operate) -> None:
-    """Two periods late, after newer ticks: p99 of the round trip must not hide it."""
+def test_late_answer_counts_once_as_lost_and_has_its_round_trip(operate: Operate) -> None:
+    """The answer is two periods late; its round trip is reported."""
     bed = operate()
     bed.tick()
     bed.command(0.0)
@@ -745,7 +745,7 @@ def test_late_answer_counts_once_as_lost_and_tells_its_round_trip(operate: Opera
         bed.tick()
         bed.command(0.0, ahead_ns=asked_ns - bed.stamp_ns)
     _, timing = bed.tick()
-    # Of three ticks that nobody answered two waited for more than a period by now.
+    # Three ticks are unanswered, two of them for more than a period.
     assert timing.lost == 2
     late_ns = bed.stamp_ns - 2 * PERIOD_NS
     bed.command(0.0, ahead_ns=late_ns - bed.stamp_ns)

@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 
 PERIOD_NS = 4_000_000
-# Host time, and stamps, at the start.
+# Host time and stamp at the start [ns].
 START_NS, STAMP_NS = 5_000_000_000, 1_700_000_000_000_000_000
 DRIFTS = (80e-6, -40e-6, 10e-6, -60e-6)
 
@@ -32,15 +32,15 @@ DRIFTS = (80e-6, -40e-6, 10e-6, -60e-6)
 @dataclass
 class Wire:
     """
-    A bus in simulated time: the host's end of it.
+    The host's end of a bus in simulated time.
 
-    :ivar now_ns: the host's clock.
-    :ivar delays_ns: from and to: each way takes a random time between the two.
-    :ivar loss: share of frames that get lost.
-    :ivar broken: whether it is gone.
+    :ivar now_ns: clock of the host [ns].
+    :ivar delays_ns: smallest and largest delay of a frame [ns].
+    :ivar loss: share of lost frames.
+    :ivar broken: whether the bus is broken.
     :ivar sent_frames: the last frames of the host.
     :ivar lost_ids: identifiers whose frames to the host are lost.
-    :ivar opened_ns: when the host opened the bus, or tried to.
+    :ivar opened_ns: times at which the host opened the bus, or tried to [ns].
     """
 
     emulators: list[Emulator] = field(default_factory=list)
@@ -59,7 +59,7 @@ class Wire:
     _to_host: list[tuple[int, int, Frame]] = field(default_factory=list)
 
     def send(self, frame: Frame) -> None:
-        """Put a frame on its way."""
+        """Send a frame to the links."""
         if self.broken:
             raise BusError('the bus is gone')
         self.sent_frames.append(frame)
@@ -81,7 +81,7 @@ class Wire:
             return frame, arrival_ns
 
     def _let_links_work(self, end_ns: int) -> None:
-        """Go on until a frame may have come to the host, and no further than an instant."""
+        """Advance the links until a frame may have arrived at the host, at most until `end_ns`."""
         while True:
             due = [emulator.next_ns for emulator in self.emulators]
             if self._to_links:
@@ -104,11 +104,11 @@ class Wire:
         self._push(self._to_host, frame, self.now_ns)
 
     def diagnostic_values(self) -> dict[str, object]:
-        """Tell how much was said."""
+        """Return the number of sent frames."""
         return {'frames_sent': self.sent}
 
     def close(self) -> None:
-        """Leave it as it is."""
+        """Do nothing."""
 
     def _push(self, queue: list[tuple[int, int, Frame]], frame: Frame, now_ns: int) -> None:
         if self.rng.random() >= self.loss and not (
@@ -119,9 +119,9 @@ class Wire:
 
 class World:
     """
-    Everything from the gate to the table.
+    A supervised prototype with its bus, its emulated links and its table.
 
-    :ivar samples: of the ticks so far.
+    :ivar samples: samples of the ticks so far.
     """
 
     def __init__(self, codec: Codec | None = None, links: tuple[int, ...] = (0, 1, 2, 3),
@@ -141,7 +141,7 @@ class World:
         self._ticks = 0
 
     def emulator(self, links: tuple[int, ...], table: str, seed: int) -> Emulator:
-        """Make links, which start now."""
+        """Make emulated links that start now."""
         now_ns = self.wire.now_ns
         plant = Plant(load_mechanism('prototype'), load_table(table),
                       InitialState(link_a=0.0, link_b=1.0, branch='open', rate_a=0.0, rate_b=0.0),
@@ -160,11 +160,11 @@ class World:
 
     @staticmethod
     def stamp_of(time_ns: int) -> int:
-        """Turn host time into stamps."""
+        """Return the stamp of a host time [ns]."""
         return time_ns - START_NS + STAMP_NS
 
     def tick(self) -> Samples:
-        """Let a period pass."""
+        """Advance time by a period."""
         due_ns = START_NS + self._ticks * PERIOD_NS
         self._ticks += 1
         self.wire.now_ns = max(self.wire.now_ns, due_ns)
@@ -177,7 +177,7 @@ class World:
         return samples
 
     def run(self, seconds: float) -> None:
-        """Let time pass."""
+        """Advance time."""
         for _ in range(round(seconds * 1e9 / PERIOD_NS)):
             self.tick()
 
@@ -191,13 +191,13 @@ class World:
         self.command = give
 
     def arm(self) -> tuple[bool, str]:
-        """Ask to drive."""
+        """Request arming."""
         return self.testbed.arm(self.wire.now_ns, ())
 
 
 @pytest.fixture
 def world() -> World:
-    """Return a world that has settled."""
+    """Return a world whose clocks and limits are settled."""
     world = World()
     world.run(1.0)
     return world
@@ -205,5 +205,5 @@ def world() -> World:
 
 @pytest.fixture
 def make_world() -> type[World]:
-    """Return what makes a world."""
+    """Return the class of worlds."""
     return World

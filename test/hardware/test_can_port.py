@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One port for every bus: frames through, arrival times of one clock, and one kind of error."""
+"""The port of every kind of bus: frames, arrival times on one clock, and errors."""
 
 from contextlib import suppress
 import errno
@@ -64,7 +64,7 @@ def stub():
 
 
 def virtual(request):
-    """Open two ports at one virtual channel."""
+    """Open two ports on one virtual channel."""
     return [open_port('virtual', request.node.name) for _ in range(2)]
 
 
@@ -77,7 +77,7 @@ def udp(request):
 
 
 def serial(request):
-    """Open two ports at the ends of one line."""
+    """Open two ports at the ends of one serial line."""
     near, far = Line(), Line()
     request.addfinalizer(near.close)
     request.addfinalizer(far.close)
@@ -86,7 +86,7 @@ def serial(request):
 
 
 class Line:
-    """A serial line with a port at one end, and with this program at the other."""
+    """A serial line between a port and this program."""
 
     def __init__(self):
         self.far, self._near = openpty()
@@ -95,14 +95,14 @@ class Line:
         self.name = os.ttyname(self._near)
 
     def close(self):
-        """Pull it out."""
+        """Disconnect the line."""
         for end in (self.far, self._near):
             with suppress(OSError):
                 os.close(end)
 
 
 def connect(*lines):
-    """Hand on what is said on one of two lines to the other, until one is closed."""
+    """Forward the bytes of each of two lines to the other one until one is closed."""
     ends = [line.far for line in lines]
     with suppress(OSError, ValueError):
         while True:
@@ -112,7 +112,7 @@ def connect(*lines):
 
 @pytest.fixture(params=[virtual, udp, serial], ids=lambda kind: kind.__name__)
 def pair(request):
-    """Open two ports that hear one another."""
+    """Open two ports that receive frames of each other."""
     ports = request.param(request)
     yield ports
     for port in ports:
@@ -120,7 +120,7 @@ def pair(request):
 
 
 def now_ns():
-    """Read the clock of arrivals."""
+    """Return the present time of the clock of arrival times [ns]."""
     return clock_gettime_ns(CLOCK_MONOTONIC_RAW)
 
 
@@ -142,7 +142,7 @@ def test_arrival_is_between_sending_and_receiving(pair):
         before_ns = now_ns()
         first.send(FRAME)
         _, arrival_ns = second.receive(PATIENCE_S)
-        # A float of system time is good to 0.3 us; both clocks are read one after the other.
+        # A float of system time has a resolution of 0.3 us, and the clocks are read in turn.
         assert before_ns - 1_000_000 <= arrival_ns <= now_ns()
 
 
@@ -155,12 +155,12 @@ def test_remote_frame_requests_eight_bytes():
 
 @pytest.mark.parametrize('interface, age_s, back_s', [
     ('pcan', 0.2, 0.2), ('pcan', 0.0, 0.0), ('pcan', -0.5, 0.0),
-    # Clocks of adapters, which begin when they like.
+    # Clocks of adapters with an arbitrary origin.
     ('pcan', 1.5, 0.0), ('pcan', -3600.0, 0.0), ('pcan', 1e9, 0.0),
-    # Whose stamps are system time is believed: it waited while nobody read.
+    # These interfaces stamp with system time, so the age is that of an unread frame.
     ('socketcan', 1.5, 1.5), ('fourbar_udp', 30.0, 30.0), ('socketcan', -0.5, 0.0),
 ])
-def test_arrival_of_what_waited(stub, interface, age_s, back_s):
+def test_arrival_time_of_a_frame_that_was_read_late(stub, interface, age_s, back_s):
     port = stub(can.Message(timestamp=time() - age_s, is_extended_id=False), interface=interface)
     before_ns = now_ns()
     _, arrival_ns = port.receive(0.0)
@@ -169,7 +169,7 @@ def test_arrival_of_what_waited(stub, interface, age_s, back_s):
     assert arrival_ns <= now_ns()
 
 
-def test_what_is_no_classic_frame_is_counted_and_dropped(stub):
+def test_other_than_classic_frames_are_counted_and_dropped(stub):
     port = stub(
         can.Message(arbitration_id=1, is_extended_id=True),
         can.Message(arbitration_id=1, is_extended_id=False, is_fd=True),
@@ -238,7 +238,7 @@ def test_closed_port_cannot_be_used(pair, refuses):
             use()
 
 
-def test_with_closes(request, refuses):
+def test_context_manager_closes_the_port(request, refuses):
     with open_port('virtual', request.node.name) as port:
         port.send(FRAME)
     with refuses(BusError, bus=port.name):
@@ -247,7 +247,7 @@ def test_with_closes(request, refuses):
 
 @pytest.mark.parametrize('interface, channel, options, values, text', [
     ('sockedcan', 'can0', '', {}, 'socketcan, fourbar_udp'),
-    # The cause depends on the kernel: no such interface, or no CAN at all.
+    # The kernel lacks either the interface or CAN.
     ('socketcan', 'can_none', '', {}, ''),
     ('virtual', 'x', 'novalue', {'option': 'novalue'}, 'key=value'),
     ('virtual', 'x', '=1', {'option': '=1'}, 'key=value'),
@@ -313,10 +313,10 @@ def test_incomplete_frame_does_not_block_and_is_completed_later(line):
 
 @pytest.mark.parametrize('noise', [
     b'\x12\x34', b'\xaa', b'\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa\xaa', b'\xbb',
-    b'\xaa' + bytes(4) + b'\x09' + bytes(8),              # a length that is none
-    b'\xaa' + bytes(4) + b'\x01\x00\x08\x00\x00\x00\xbb',   # an identifier that is none
-    b'\xaa' + bytes(4) + b'\x01\x00\x01\x00\x00\x00\xbc'])  # an end that is none
-def test_noise_on_a_line_costs_no_frame_after_it(line, noise):
+    b'\xaa' + bytes(4) + b'\x09' + bytes(8),              # an invalid length
+    b'\xaa' + bytes(4) + b'\x01\x00\x08\x00\x00\x00\xbb',   # an invalid identifier
+    b'\xaa' + bytes(4) + b'\x01\x00\x01\x00\x00\x00\xbc'])  # an invalid end
+def test_noise_on_a_line_corrupts_no_later_frame(line, noise):
     said = b'\xaa' + bytes(4) + b'\x02' + b'\x23\x01\x00\x00' + b'ab\xbb'
     with open_port('serial', line.name) as port:
         os.write(line.far, said + noise + 20 * said)
@@ -359,14 +359,14 @@ def test_python_can_is_not_imported_before_it_is_needed():
     assert subprocess.run([sys.executable, '-c', code], timeout=60).returncode == 0
 
 
-def test_who_forgets_to_close_is_not_scolded_on_stderr():
+def test_open_ports_at_exit_print_nothing():
     code = ('from fourbar_ros.hardware.can_port import open_port; '
             'open_port("virtual", "x"); open_port("virtual", "y")')
     done = subprocess.run([sys.executable, '-c', code], timeout=60, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
 
 
-def test_python_can_still_tells_who_wants_to_know(request):
+def test_messages_of_python_can_reach_a_log_handler(request):
     records = []
     handler = logging.Handler()
     handler.emit = records.append

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The checksum is that of SAE J1850, and no flipped bit goes by."""
+"""The checksum of frames is CRC-8 SAE J1850 over identifier and data."""
 
 from crccheck.crc import Crc8SaeJ1850
 from fourbar_ros.hardware.checksum import checksum
@@ -10,7 +10,7 @@ import pytest
 
 
 def test_check_value_of_the_catalogue():
-    """Of `123456789`, the first two bytes of which are the identifier here."""
+    """The text is `123456789`; its first two bytes are the identifier."""
     assert checksum(0x3132, b'3456789') == 0x4B
 
 
@@ -24,8 +24,8 @@ def test_agrees_with_another_implementation(seed):
             assert checksum(int(frame_id), data) == expected, f'seed {seed}'
 
 
-def test_identifier_counts():
-    """Under no other identifier that differs in up to 8 neighbouring bits."""
+def test_checksum_depends_on_the_identifier():
+    """Identifiers that differ in up to 8 adjacent bits have different checksums."""
     data = bytes(range(7))
     for bits in range(1, 256):
         for shift in range(11):

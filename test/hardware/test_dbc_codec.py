@@ -41,7 +41,7 @@ CODEC = DbcCodec('prototype')
 FILE = share_directory() / 'config' / 'prototype.dbc'
 DATABASE = cantools.database.load_file(FILE)
 TURN, WRAP_US = 256 * 2 * pi, 10 * 2 ** 20
-# Half a count of angles, and of single precision.
+# Half a count of angles [rad], and relative rounding of float32.
 HALF_COUNT, SINGLE = pi / 65536, 2.0 ** -24
 
 links, bytes_ = st.integers(0, 3), st.integers(0, 255)
@@ -61,7 +61,7 @@ OF_LINKS = [WHEEL, MOTOR, ANGLE, CLOCK, HEARTBEAT]
 
 
 def named(value):
-    """Name a message by its kind: faults are a set, whose order differs from run to run."""
+    """Name a message by its kind: the order of a set of faults differs from run to run."""
     return type(value).__name__ if isinstance(value, ToHost | ToLinks) else str(value)
 
 
@@ -77,7 +77,7 @@ def written(message):
 
 
 def read(frame):
-    """Read a frame at whichever end understands it."""
+    """Decode a frame at the end that it is for."""
     message = CODEC.from_links(frame)
     return CODEC.from_host(frame) if message is None else message
 
@@ -163,7 +163,7 @@ def test_heartbeat(link, sequence, state, faults, voltage, temperature, boot):
     assert replace(back, voltage=voltage, temperature=temperature) == report
 
 
-def test_times_and_angles_of_any_size_are_reduced():
+def test_large_times_and_angles_are_wrapped():
     far = replace(WHEEL, angle=WHEEL.angle - 3 * TURN, time_us=WHEEL.time_us + 5 * WRAP_US)
     assert written(far) == written(WHEEL)
 
@@ -187,7 +187,7 @@ def test_every_flipped_bit_is_caught(message):
 
 
 @each_message
-def test_under_another_identifier_it_is_not_taken(message):
+def test_data_under_another_identifier_are_rejected(message):
     frame = written(message)
     for frame_id in CODEC.frame_ids - {frame.frame_id}:
         with pytest.raises(FrameError) as caught:
@@ -246,7 +246,7 @@ def test_invalid_value_is_not_encoded(message):
     (Stop(), 'CODE', 0x3C), (Release(), 'CODE', 0),
 ], ids=named)
 def test_invalid_count_is_not_decoded(message, signal, count):
-    """Though its checksum is right."""
+    """The value is invalid and the checksum is correct."""
     frame = written(message)
     layout = DATABASE.get_message_by_frame_id(frame.frame_id)
     counts = layout.decode_simple(frame.data, decode_choices=False, scaling=False)
@@ -267,7 +267,7 @@ def test_no_two_messages_share_an_identifier():
     assert max(CODEC.frame_ids) < 0x800
 
 
-# A lab's own copy
+# Changed copies of the file
 
 @pytest.fixture
 def changed(tmp_path):
@@ -283,7 +283,7 @@ def changed(tmp_path):
     return make
 
 
-def test_identifiers_places_and_scales_are_those_of_the_file(changed):
+def test_identifiers_positions_and_scales_are_those_of_the_file(changed):
     codec = changed(
         (r'\b304\b', '400'),
         (r'^ SG_ ANGLE : 0\|16@1- .*$',
@@ -326,7 +326,7 @@ def test_further_signals_are_ignored(changed):
      {'message': 'LINK_A_LIMITS', 'signal': 'SPEED', 'value': -0.1, 'limit': 0.0}),
     (r'\b257\b', '258', {'message': 'LINK_B_COMMAND', 'value': 0x102}),
     (r'^BO_ 272 ', 'BO_ 2147483920 ', {'message': 'LINK_A_WHEEL', 'value': 272, 'limit': 0x7FF}),
-    # Signals that overlap, or that reach beyond the message, and a line that is cut.
+    # Overlapping signals, a signal beyond the end of the message, and an incomplete line.
     (r'^ SG_ MODE : 32\|1', ' SG_ MODE : 31|1', {}),
     (r'^ SG_ CHECKSUM : 56\|8', ' SG_ CHECKSUM : 56|9', {}), (r'^BU_:', 'BU_ ', {}),
 ])
@@ -349,7 +349,7 @@ def test_invalid_dbc_file_is_refused_in_one_line(tmp_path, content, refuses):
 
 
 def test_file_cut_anywhere_is_refused_or_read(tmp_path):
-    """Never anything but the package's own error."""
+    """The only possible error is that of the package."""
     text = FILE.read_text()
     path = tmp_path / 'cut.dbc'
     for length in range(0, len(text), len(text) // 60):
@@ -360,7 +360,7 @@ def test_file_cut_anywhere_is_refused_or_read(tmp_path):
 
 @pytest.mark.parametrize('name, presets', [
     ('nothing', ['odrive', 'prototype']), ('./nothing.dbc', None)])
-def test_file_that_is_not_there(name, presets, refuses):
+def test_missing_file_is_refused(name, presets, refuses):
     with refuses(ConfigurationError, name=name, limit=presets):
         DbcCodec(name)
 

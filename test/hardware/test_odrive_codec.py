@@ -45,7 +45,7 @@ def make(**options):
     return OdriveCodec(torque_constants=CONSTANTS, **options)
 
 
-# Those that only write and read what has no memory.
+# Ends for messages without state.
 HOST, LINK = make(), make()
 
 
@@ -95,7 +95,7 @@ def test_limits(link, torque, speed):
 @repeatable
 @given(links, st.floats(-10.0, 10.0), st.booleans(), st.booleans())
 def test_command_after_any_other(link, value, by_speed, enable):
-    """The last word of the frames is the command, whichever were sent before."""
+    """The last frame has the effect of the command, after any other command."""
     command = received(HOST, LINK, Command(link, value, by_speed, enable, 0))[-1]
     assert (command.link, command.enable) == (link, enable)
     if enable:
@@ -116,7 +116,7 @@ def sent(host, message):
     return [(frame.frame_id >> 5, frame.frame_id & 31) for frame in host.to_links(message)]
 
 
-def test_mode_and_state_are_sent_where_they_change():
+def test_mode_and_state_are_sent_when_they_change():
     host = make()
     torque, speed = (Command(2, 0.5, by_speed, True, 0) for by_speed in (False, True))
     mode, state = (2, 0x0B), (2, 0x07)
@@ -134,7 +134,7 @@ def test_power_off_is_repeated_and_power_on_is_not():
     enabled, disabled = (Command(0, 0.0, False, enable, 0) for enable in (True, False))
     assert [sent(host, disabled) for _ in range(3)] == [[(0, 0x07)]] * 3
     assert sent(host, enabled).count((0, 0x07)) == 1
-    # An ODrive that disarmed by itself is not armed again by a command that goes on.
+    # Repeated commands do not arm an ODrive that has disarmed by itself.
     assert sent(host, enabled).count((0, 0x07)) == 0
 
 
@@ -147,8 +147,8 @@ def test_after_a_stop_everything_is_sent_again(message):
     assert len(host.to_links(command)) == 4
 
 
-def test_link_with_power_never_has_an_old_value():
-    """Neither when it gets power, nor in the other mode: only the last or the present one."""
+def test_link_with_power_never_follows_an_old_value():
+    """With power on, the link follows the last command or the present one in every mode."""
     host, link = make(), make()
     last = None
     for value, by_speed, enable in (
@@ -178,7 +178,7 @@ def test_frames_are_those_of_the_manual():
 
 
 def test_sync_requests_every_answer():
-    """The sensor boards by `SYNC`, every ODrive for wheel and motor, and one now and again."""
+    """`SYNC` requests the sensor boards, remote frames the ODrives' wheel and motor messages."""
     host, link = make(), make()
     assert max(len(host.to_links(Sync(counter))) for counter in range(16)) == 9
     for node in range(4):
@@ -206,7 +206,7 @@ def test_sync_requests_every_answer():
     (1 << 13, 1, LinkState.FAULT, {'overtemperature'}),
     (1 << 14, 1, LinkState.FAULT, {'overtemperature'}),
     (1 << 15, 8, LinkState.FAULT, {'overspeed'}), (1 << 5, 1, LinkState.FAULT, {'driver'}),
-    # Bits that nobody has given a meaning yet are taken for the worst.
+    # Undefined bits are a driver fault.
     (1 << 31, 8, LinkState.FAULT, {'driver'}),
     (1 << 3 | 1 << 8 | 1 << 9, 1, LinkState.FAULT, {'encoder', 'driver', 'undervoltage'}),
 ])
@@ -222,7 +222,7 @@ def test_state_and_faults_of_an_odrive(error, axis_state, state, faults):
        st.floats(0.0, 60.0), st.floats(-20.0, 150.0))
 def test_health_goes_through(link, state, faults, voltage, temperature):
     if (state is LinkState.FAULT) != bool(faults):
-        # An ODrive with an error is disarmed, and that is all it knows.
+        # An ODrive reports no more than an error and that it is disarmed.
         faults = frozenset({'driver'}) if state is LinkState.FAULT else frozenset()
     host = OdriveCodec()
     for frame in OdriveCodec().to_host(
@@ -242,7 +242,7 @@ def test_voltage_and_temperature_complete_the_last_heartbeat():
     host = OdriveCodec()
     bus = Frame(identifier(1, 0x17), struct.pack('<ff', 24.0, 1.0))
     hot = Frame(identifier(1, 0x15), struct.pack('<ff', 40.0, 60.0))
-    # Nothing is known of its state yet.
+    # The host has no state of this link yet.
     assert host.from_links(bus) is None
     assert host.from_links(heartbeat(1, 0, 8)) == Heartbeat(
         1, None, LinkState.ARMED, frozenset(), 24.0)
@@ -253,19 +253,19 @@ def test_voltage_and_temperature_complete_the_last_heartbeat():
     assert host.from_links(heartbeat(2, 0, 8)).voltage is None
 
 
-def test_limits_are_missing_until_they_were_sent():
+def test_limits_are_missing_until_they_are_sent():
     host = make()
     assert host.from_links(heartbeat(1, 0, 1)).faults == {'no_limits'}
     host.to_links(Limits(1, 0.05, 300.0))
     assert host.from_links(heartbeat(1, 0, 1)).faults == set()
     assert host.from_links(heartbeat(2, 0, 1)).faults == {'no_limits'}
-    # It starts anew.
+    # The ODrive restarts.
     assert 'no_limits' in host.from_links(heartbeat(1, 1, 0)).faults
     assert host.from_links(heartbeat(1, 0, 1)).faults == {'no_limits'}
 
 
 def test_limits_are_sent_again_before_power():
-    """An ODrive may have restarted unnoticed."""
+    """The host may have missed the restart of an ODrive."""
     host, link = make(), make()
     limits = host.to_links(Limits(1, 0.05, 300.0))
     enabled, disabled = (Command(1, 0.01, False, enable, 0) for enable in (True, False))
@@ -312,7 +312,7 @@ def test_flipped_bit_of_a_sensor_board_is_caught():
 
 
 def test_no_two_messages_share_an_identifier():
-    """Neither the ODrives' nor the sensor boards'."""
+    """The test covers the messages of ODrives and of sensor boards."""
     assert len(HOST.frame_ids) == 4 * 12 + 1 + 4 * 2
     assert {frame_id for frame_id in HOST.frame_ids if frame_id < 0x80} == {
         identifier(node, command) for node in range(4) for command in
@@ -333,7 +333,7 @@ def test_sensor_boards_that_use_an_identifier_of_an_odrive_are_refused(
     ('Axis2_Get_Torques', 'Axis2_Torques', 'Axis2_Get_Torques', None),
     ('Pos_Estimate', 'Position', 'Axis0_Get_Encoder_Estimates', 'Pos_Estimate'),
     ('Axis_Error : 0|32', 'Axis_Error : 0|16', 'Axis0_Heartbeat', 'Axis_Error')])
-def test_file_that_lacks_something_is_refused(tmp_path, old, new, message, signal, refuses):
+def test_incomplete_file_is_refused(tmp_path, old, new, message, signal, refuses):
     text = (share_directory() / 'config' / 'odrive.dbc').read_text()
     path = tmp_path / 'lab.dbc'
     path.write_text(text.replace(old, new))
@@ -349,7 +349,7 @@ def test_foreign_frames_are_ignored():
 
 @pytest.mark.parametrize('frame_id', sorted(HOST.frame_ids), ids=hex)
 def test_wrong_length(frame_id):
-    """At the one end that a frame is for."""
+    """The end that the frame is for rejects it."""
     refused = 0
     for length in range(9):
         for read in (HOST.from_links, LINK.from_host):

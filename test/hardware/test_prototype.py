@@ -6,7 +6,7 @@
 import numpy as np
 import pytest
 
-# The angle sensors' 14 bits, and what the bus makes of them; in radians.
+# Resolution of the angle sensors, 14 bits [rad].
 ANGLE_STEP = 2.0 * np.pi / 2 ** 14
 
 
@@ -20,7 +20,7 @@ def test_samples_are_those_of_the_table(world) -> None:
         for reading in samples.links:
             angles[reading.names[0]].append(reading.angles[0])
     for link, (name, read) in enumerate(angles.items()):
-        # All at rest: 0.1 deg of noise, 99 % of 250 samples a second.
+        # The links are at rest: 0.1 deg of noise, 99 % of 250 samples a second.
         assert 470 <= len(read) <= 505, name
         expected = np.remainder(truth.link_angles[link] + np.pi, 2.0 * np.pi) - np.pi
         assert abs(np.mean(read) - expected) < 5.0 * 1.7453e-3 / np.sqrt(470) + ANGLE_STEP
@@ -32,7 +32,7 @@ def test_stamps_are_times_of_measurement(world) -> None:
     world.run(2.0)
     for samples in world.samples:
         for reading in samples.links:
-            # The table measures once per 4 ms of its time, at which the stamp must be.
+            # The table measures every 4 ms; the stamp is the time of the measurement.
             off_ns = (reading.stamp_ns - world.stamp_of(0) - 5_000_000_000 + 2_000_000) % 4_000_000
             assert abs(off_ns - 2_000_000) < 100_000
             age_ns = samples.stamp_ns - reading.stamp_ns
@@ -54,7 +54,7 @@ def test_torque_reaches_the_wheels_and_is_reported(world) -> None:
     truth = world.wire.emulators[0].samples.truth
     np.testing.assert_allclose(last.wheels.efforts, 0.01, rtol=1e-3)
     assert (truth.wheel_speeds > 20.0).all()
-    # As they were one step before, and half a period earlier on the mean.
+    # The speeds are those of one step before, as means over a period.
     np.testing.assert_allclose(last.wheels.speeds, truth.wheel_speeds, atol=0.5)
     positions = np.array([samples.wheels.angles for samples in world.samples])
     speeds = np.array([samples.wheels.speeds for samples in world.samples])
@@ -68,7 +68,7 @@ def test_disarming_ends_torque(world) -> None:
     world.run(0.2)
     world.testbed.disarm('test')
     world.command = None
-    # The motors fade with 3 ms.
+    # The motor torque decays with a time constant of 3 ms.
     world.run(0.1)
     np.testing.assert_allclose(world.samples[-1].wheels.efforts, 0.0, atol=1e-9)
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A bought motor driver takes the place of the links' own, and nothing else changes."""
+"""The prototype with ODrives in place of the motor drivers of the links."""
 
 from fourbar_ros.device import DeviceState
 from fourbar_ros.hardware.odrive_codec import OdriveCodec

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What stops the prototype: safety rules, link faults, bus faults, bad frames."""
+"""Reactions of the prototype: safety rules, link faults, bus faults, invalid frames."""
 
 from math import inf, nan
 from pathlib import Path
@@ -27,7 +27,7 @@ TORQUE = (0.01, 0.01, 0.01, 0.01)
 
 @pytest.fixture
 def driven(world):
-    """Return a world whose wheels are driven."""
+    """Return a world with driven wheels."""
     world.torque(*TORQUE)
     assert world.arm() == (True, 'armed')
     world.run(0.2)
@@ -40,7 +40,7 @@ def firmware(world, link: int):
 
 
 def assert_coasting(world) -> None:
-    """No link has power, and none gets torque."""
+    """Check that no link has power or torque."""
     world.run(0.1)
     assert not any(firmware(world, link).drive()[2] for link in range(4))
     np.testing.assert_allclose(
@@ -48,7 +48,7 @@ def assert_coasting(world) -> None:
 
 
 def wait(world, condition, seconds: float) -> float:
-    """Return after how long something is so [s]."""
+    """Wait for a condition, and return the duration of the wait [s]."""
     begin_ns = world.wire.now_ns
     while not condition():
         assert world.wire.now_ns - begin_ns < seconds * 1e9, 'not in time'
@@ -70,7 +70,7 @@ def test_link_fault_stops_the_wheels(driven, kind, state, within, rule, numbers)
     assert driven.testbed.arming.reason.startswith(f'link_c: {rule}: ')
     assert all(number in driven.testbed.arming.reason for number in numbers)
     if kind == 'reboot':
-        # The rule `not_armed` applies too, before or after.
+        # The rule `not_armed` applies too, earlier or later.
         assert_coasting(driven)
         return
     assert_coasting(driven)
@@ -85,8 +85,8 @@ def test_link_fault_stops_the_wheels(driven, kind, state, within, rule, numbers)
 @pytest.mark.parametrize(('kind', 'state'), [
     ('silent', DeviceState.DISARMED), ('hot', DeviceState.DISARMED),
     ('reboot', DeviceState.EMERGENCY_STOP)])
-def test_parked_wheels_under_power_are_monitored_too(make_world, kind, state) -> None:
-    # Before the links coast by themselves.
+def test_parked_wheels_are_monitored_too(make_world, kind, state) -> None:
+    # The timeout is shorter than that of the links.
     world = make_world(supervisor=SupervisorSettings(
         command_timeout=0.05, timeout_action='hold_speed'))
     world.run(1.0)
@@ -104,7 +104,7 @@ def test_parked_wheels_under_power_are_monitored_too(make_world, kind, state) ->
 
 
 def test_heartbeat_lost_while_armed_is_an_emergency_stop(driven) -> None:
-    # The wheels go on answering: only the heartbeats are lost.
+    # Only the heartbeats are lost: the wheels answer.
     driven.wire.lost_ids.update(
         driven.codec.to_host(Heartbeat(link, 0, LinkState.IDLE, frozenset(), boot=0))[0].frame_id
         for link in range(4))
@@ -173,7 +173,7 @@ def test_after_a_bus_failure_wheels_coast_until_armed(driven, seconds) -> None:
     assert not any(samples.complete for samples in driven.samples[-50:])
     emulator.inject_fault('bus', '')
     driven.run(2.0)
-    # Commands come at every tick, and nothing moves for them.
+    # Commands arrive at every tick and have no effect.
     assert all(samples.complete for samples in driven.samples[-50:])
     assert_coasting(driven)
     assert driven.testbed.arming.state is DeviceState.EMERGENCY_STOP
@@ -196,7 +196,7 @@ def test_links_coast_by_themselves_when_the_host_is_gone(driven) -> None:
     assert_coasting(driven)
 
 
-def test_bus_that_is_gone_is_a_fault_and_comes_back(driven) -> None:
+def test_broken_bus_is_a_fault_and_is_opened_again(driven) -> None:
     driven.wire.broken = True
     with pytest.raises(BusError):
         driven.tick()
@@ -218,7 +218,7 @@ def test_missing_gyros_are_reported(make_world) -> None:
     assert world.prototype.diagnostics()['link_a'] == NO_RATE
 
 
-def test_bus_that_is_gone_during_a_stop_is_not_opened_at_every_tick(driven) -> None:
+def test_broken_bus_during_a_stop_is_not_opened_at_every_tick(driven) -> None:
     """Opening a bus may take seconds, in which nothing is received."""
     driven.testbed.emergency_stop('test')
     driven.wire.broken = True
@@ -239,7 +239,7 @@ def test_emergency_stop_latches_in_the_links_too(driven) -> None:
     driven.testbed.emergency_stop('test')
     driven.run(0.01)
     assert [firmware(driven, link).state for link in range(4)] == [LinkState.STOPPED] * 4
-    # Not even a command of somebody else moves them.
+    # A command of another host has no effect either.
     driven.wire.emulators[0].receive(
         driven.codec.to_links(Command(0, 0.01, False, True, 99))[0], driven.wire.now_ns)
     assert_coasting(driven)
@@ -329,8 +329,8 @@ def test_repeated_heartbeats_are_rejected(driven) -> None:
     assert 'link_b: heartbeat_lost: ' in driven.testbed.arming.reason
 
 
-def test_heartbeats_count_on_after_a_long_silence(driven) -> None:
-    """Whatever their number is by then."""
+def test_heartbeats_are_accepted_after_a_long_silence(driven) -> None:
+    """The durations give different sequence numbers of the first heartbeat after the silence."""
     for seconds in (1.2, 1.25, 1.3, 1.4, 1.6):
         driven.wire.emulators[0].inject_fault('link_b', 'silent')
         driven.run(seconds)
@@ -341,7 +341,7 @@ def test_heartbeats_count_on_after_a_long_silence(driven) -> None:
 
 
 def test_old_command_does_not_move_a_wheel(driven) -> None:
-    """A frame that was recorded while driving is played back after disarming."""
+    """Frames recorded while the wheels are driven are replayed after disarming."""
     recorded = [frame for frame in driven.wire.sent_frames
                 if isinstance(driven.codec.from_host(frame), Command)][-4:]
     driven.testbed.disarm('test')
@@ -354,7 +354,7 @@ def test_old_command_does_not_move_a_wheel(driven) -> None:
 
 
 def test_host_with_a_new_count_is_accepted_after_a_timeout_without_power(world) -> None:
-    """As after an outage in which more commands were lost than the count goes."""
+    """The case is an outage longer than the range of the command counter."""
     link, now_ns = firmware(world, 0), world.wire.now_ns
     limit_ns = 110_000_000
     disarm, drive = (Command(0, 0.0, False, enable, (link.sequence + 200) % 256)
@@ -384,7 +384,7 @@ def test_motor_that_gives_torque_without_power_stops_everything(world) -> None:
     world.torque(0.001)
     assert world.arm()[0]
     world.run(0.1)
-    # Only wheel a has power: the others' electronics go mad.
+    # Only wheel a is commanded; the driver of wheel c gives torque by itself.
     world.wire.emulators[0].table.break_down(
         'flywheel_c', Fault('flywheel_c', 'shorted', 0.02))
     wait(world, lambda: not world.testbed.arming.armed, 0.5)
@@ -402,7 +402,7 @@ def test_stop_of_another_host_stops_the_links(driven) -> None:
 
 
 def test_links_stopped_by_another_host_are_released_by_a_reset(world) -> None:
-    """As by a host before this one, or where the release was lost."""
+    """An earlier host has stopped the links, or the release was lost."""
     world.wire.send(world.codec.to_links(Stop())[0])
     world.run(0.1)
     assert world.testbed.arming.state is DeviceState.DISARMED
@@ -416,7 +416,7 @@ def test_links_stopped_by_another_host_are_released_by_a_reset(world) -> None:
     assert world.arm() == (True, 'armed')
 
 
-def test_links_stay_no_longer_stopped_than_until_a_reset_reaches_them(driven) -> None:
+def test_links_stay_stopped_until_a_reset_arrives(driven) -> None:
     driven.testbed.emergency_stop('test')
     driven.run(0.1)
     driven.wire.broken = True
@@ -433,14 +433,14 @@ def test_links_stay_no_longer_stopped_than_until_a_reset_reaches_them(driven) ->
     assert driven.arm() == (True, 'armed')
 
 
-def test_flood_of_foreign_frames_does_not_hold_the_host_up(driven) -> None:
+def test_flood_of_foreign_frames_does_not_delay_the_host(driven) -> None:
     for _ in range(5000):
         driven.wire.inject(Frame(0x7FF, b'?'))
     driven.run(1.0)
     assert driven.testbed.arming.armed
 
 
-# The table in the file
+# Safety table
 
 ROWS = load_safety('prototype')
 
@@ -458,8 +458,8 @@ def write(tmp_path: Path, **changes) -> str:
     return str(path)
 
 
-def test_emulated_links_differ_only_in_waits() -> None:
-    """And they wait for an answer as long as a shared computer may stall, half a second."""
+def test_safety_table_of_emulated_links_differs_only_in_timeouts() -> None:
+    """The timeout is half a second, because a shared computer may stall."""
     real, emulated = load_safety('prototype'), load_safety('emulated')
     assert {name for name in real if real[name] != emulated[name]} == {
         'wheel_silent', 'heartbeat_lost'}

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""CAN frames in datagrams: from peers to peers, stamped when they arrive."""
+"""CAN frames in datagrams between peers, stamped on arrival."""
 
 import socket
 import struct
@@ -12,18 +12,18 @@ from fourbar_ros.hardware.udp_bus import UdpBus
 import numpy as np
 import pytest
 
-# Long enough on a busy machine; nothing waits for it in vain.
+# Time limit of a wait on a busy machine [s].
 PATIENCE_S = 5.0
 
 
 def address(bus):
-    """Return where a bus is reached."""
+    """Return the address of a bus."""
     return '{}:{}'.format(*bus.address)
 
 
 @pytest.fixture
 def make():
-    """Return a function that opens a bus at a free port, by the name python-can knows it by."""
+    """Return a function that opens a bus at a free port by its name in python-can."""
     buses = []
 
     def make(peers=()):
@@ -93,12 +93,12 @@ def test_stamps_are_of_arrival_and_never_go_back(pair):
     for number in range(200):
         first.send(can.Message(arbitration_id=number, is_extended_id=False))
     sent = time()
-    # Nobody reads before all of them have come.
+    # The test reads the frames after all of them have arrived.
     received = [second.recv(PATIENCE_S) for _ in range(200)]
     assert [message.arbitration_id for message in received] == list(range(200))
     stamps = [message.timestamp for message in received]
     assert stamps == sorted(stamps)
-    # A float of system time is good for less than a microsecond.
+    # A float of system time has a resolution below a microsecond.
     assert before - 1e-6 <= stamps[0] and stamps[-1] <= sent + 1e-6
 
 
@@ -150,7 +150,7 @@ def test_malformed_datagrams_are_ignored_and_counted(make, plain, datagram):
     assert (bus.foreign, bus.malformed) == (0, 1)
 
 
-def test_a_look_costs_no_time_and_a_wait_ends(pair):
+def test_receive_returns_at_once_without_a_timeout_and_at_the_timeout(pair):
     first, _ = pair
     began = monotonic()
     assert first.recv(0) is None
@@ -159,15 +159,15 @@ def test_a_look_costs_no_time_and_a_wait_ends(pair):
 
 
 def test_absent_peer_is_no_error(make, plain):
-    nobody = plain.getsockname()[1]
+    unused = plain.getsockname()[1]
     plain.close()
-    bus = make(f'127.0.0.1:{nobody}')
+    bus = make(f'127.0.0.1:{unused}')
     for _ in range(5):
         bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         assert bus.recv(0) is None
 
 
-def test_its_descriptor_tells_when_there_is_something(pair):
+def test_file_descriptor_is_readable_when_a_frame_has_arrived(pair):
     first, second = pair
     notified = can.Notifier(second, [reader := can.BufferedReader()], timeout=0.01)
     try:
@@ -213,7 +213,7 @@ def test_port_in_use(make):
     ('127.0.0.1', {'peers': ()}, "'127.0.0.1'"), (':1', {'peers': ()}, "':1'"),
     ('127.0.0.1:65536', {'peers': ()}, "'127.0.0.1:65536'"),
     ('127.0.0.1:x', {'peers': ()}, "'127.0.0.1:x'"),
-    # Too long for a host name, so that no name server is asked.
+    # The host name is too long, so that no name server is queried.
     (f'{"x" * 64}:0', {'peers': ()}, f"'{'x' * 64}:0'"),
     ('192.0.2.1:0', {'peers': ()}, '192.0.2.1:0'),
     ('127.0.0.1:0', {}, 'peers'), ('127.0.0.1:0', {'peers': ''}, 'peers'),

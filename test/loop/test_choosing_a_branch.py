@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The prototype leaves a change point on the branch that a setpoint names, and comes back.
+The prototype leaves a change point on the branch that a setpoint names, and returns.
 
-Its joints give a little, as real ones do. Rigid ones leave the branch only if the angle between
-the pairs is exactly zero, which no wheel can make it (docs/mechanics.md).
+The joints are compliant. With rigid joints a linkage changes the branch only if the angle between
+the pairs is exactly zero, which the wheels cannot achieve (docs/mechanics.md).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 SEEDS = range(5)
 
-# Of each joint [N/m], [N s/m]; and how well the estimator may take the loop to close [m].
+# Stiffness [N/m] and damping [N s/m] of each joint, and closure tolerance of the estimator [m].
 STIFFNESS, DAMPING = 1e4, 5.0
 CLOSURE = 1e-4
 
@@ -35,7 +35,7 @@ OPENED = radians(30.0)
 LARGEST_ERROR = 0.5
 
 
-def giving(mechanism: Mechanism) -> Mechanism:
+def compliant(mechanism: Mechanism) -> Mechanism:
     return replace(mechanism, joint_stiffness=np.full(4, STIFFNESS),
                    joint_damping=np.full(4, DAMPING))
 
@@ -49,10 +49,10 @@ def pose(branch: Branch, heading: float, theta: float) -> tuple[float, ...]:
 @pytest.mark.parametrize('seed', SEEDS)
 @pytest.mark.parametrize(('theta', 'other'), [(0.0, FOLDED), (pi, CROSSED)],
                          ids=['folded', 'crossed'])
-def test_it_goes_out_on_the_branch_that_is_named_and_comes_back(
+def test_linkage_moves_on_the_named_branch_and_back(
     theta: float, other: Branch, seed: int,
 ) -> None:
-    """Friction, noise, late and lost samples; each rest within 0.5 deg, all four links."""
+    """With friction, noise, latency and dropout all links rest within 0.5 deg of each goal."""
     base = load_scenario('prototype')
     heading = float(np.random.default_rng(seed).uniform(-pi, pi))
     inside = 0.6 if theta == 0.0 else pi - 0.6
@@ -60,7 +60,7 @@ def test_it_goes_out_on_the_branch_that_is_named_and_comes_back(
              pose(other, heading, theta), pose(PARALLELOGRAM, heading, inside))
     begins = [BEGIN + number * (DURATION + REST) for number in range(len(goals))]
     scenario = replace(
-        base, mechanism=giving(base.mechanism), model=giving(base.model), seed=seed,
+        base, mechanism=compliant(base.mechanism), model=compliant(base.model), seed=seed,
         initial=InitialState(heading, heading + inside),
         estimator=replace(base.estimator, closure_tolerance=CLOSURE),
         controller=replace(base.controller, change_points='choose'),

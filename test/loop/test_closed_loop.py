@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The closed loop does what the whole suite is for."""
+"""Manoeuvres, momentum and arming of the closed loop."""
 
 from collections.abc import Callable
 from math import pi
@@ -23,13 +23,13 @@ MakeLoop = Callable[..., ClosedLoop]
 
 PERIOD_NS = 4_000_000
 HALF_A_DEGREE = pi / 360.0
-# Peak of the soft step's rate times A = 1.44e-4 kg m^2, shared by two wheels of 3.4e-7 kg m^2.
+# Peak rate of the soft step times A = 1.44e-4 kg m^2, by two wheels of 3.4e-7 kg m^2 [rad/s].
 PEAK = 62.37
 
 
 @pytest.fixture(scope='module')
 def uneven() -> Mechanism:
-    """Make a linkage with nothing equal to anything else."""
+    """Make a linkage without equal parameters."""
     return Mechanism(  # type: ignore[arg-type]
         [0.12, 0.08, 0.11, 0.10], [0.02, 0.03, 0.025, 0.018], [2.2e-5, 1.5e-5, 3e-5, 1.8e-5],
         [[0.05, 0.01], [0.04, -0.01], [0.06, 0.005], [0.05, 0.0]], [3e-7, 4e-7, 5e-7, 2e-7],
@@ -111,7 +111,7 @@ def test_quarter_turn_of_the_paper(make_loop: MakeLoop) -> None:
 def test_linkage_without_symmetry_on_both_branches(
     branch: str, uneven: Mechanism, make_loop: MakeLoop,
 ) -> None:
-    """It turns and changes its configuration at once."""
+    """The linkage turns and changes its configuration in one move."""
     loop = make_loop(uneven, 1.5, branch)
     steps = quarter_turn(loop, change=0.3)
     check_tracking(loop, steps)
@@ -119,7 +119,7 @@ def test_linkage_without_symmetry_on_both_branches(
 
 
 def test_crossed_branch_of_an_antiparallelogram(make_loop: MakeLoop) -> None:
-    """Opposite links equal, neighbours not: the crossed assembly of the same bars."""
+    """Opposite links are equal and neighbours are not."""
     rectangle = Mechanism(  # type: ignore[arg-type]
         [0.12, 0.08, 0.12, 0.08], [0.02] * 4, [2.2e-5] * 4, [[0.05, 0.0]] * 4, [3.4e-7] * 4,
         [1e-4] * 4, [500.0] * 4)
@@ -136,11 +136,11 @@ def momentum(loop: ClosedLoop, step: Step) -> float:
                             absolute_speeds(step))
 
 
-def test_total_momentum_stays_zero_while_wheels_and_links_trade_it(make_loop: MakeLoop) -> None:
+def test_total_momentum_stays_zero_while_wheels_and_links_exchange_it(make_loop: MakeLoop) -> None:
     loop = make_loop()
     steps = quarter_turn(loop)
     traded = 3.4e-7 * PEAK * 4
-    # 22000 steps, some ten roundings each, all to the same side.
+    # Bound of the rounding errors: 22000 steps with ten roundings of one sign.
     assert max(abs(momentum(loop, step)) for step in steps) < 22000 * 10 * 1.1e-16 * traded
 
 
@@ -159,7 +159,7 @@ def test_emergency_stop_in_motion_lets_the_wheels_coast(make_loop: MakeLoop) -> 
         assert step.control is not None
         assert not step.samples.wheels.efforts.any()
         assert not step.control.torques.any()
-    # The whole goes on turning with what the links had; nothing goes in or out.
+    # The links keep their momentum: no torque acts on the whole.
     assert momentum(loop, steps[-1]) == pytest.approx(0.0, abs=1e-11 * 3.4e-7 * PEAK * 4)
     truth = steps[-1].samples.truth
     assert truth is not None
@@ -169,7 +169,7 @@ def test_emergency_stop_in_motion_lets_the_wheels_coast(make_loop: MakeLoop) -> 
 
 
 def test_run_again_after_an_emergency_stop(make_loop: MakeLoop) -> None:
-    """Reset and armed again, the controller brings links that drift to a halt."""
+    """After reset and arming, the controller stops the drifting links."""
     loop = make_loop()
     loop.controller.setpoint(['link_a', 'link_b'], [pi / 2, pi / 3 + pi / 2])
     for _ in range(600):
@@ -183,13 +183,13 @@ def test_run_again_after_an_emergency_stop(make_loop: MakeLoop) -> None:
         step = loop.step()
     truth = step.samples.truth
     assert truth is not None
-    # 4 s are more than ten time constants of the law; what is left is the noise it feels.
+    # 4 s are more than ten time constants of the law; the measurement noise remains.
     assert np.abs(truth.link_rates).max() < 0.02
     assert loop.controller.mode == 'hold'
 
 
 def fingerprint(loop: ClosedLoop) -> bytes:
-    """Return every number of a short manoeuvre."""
+    """Return all numbers of a short manoeuvre."""
     loop.controller.setpoint(['link_a'], [0.3])
     values: list[Array] = []
     for _ in range(300):

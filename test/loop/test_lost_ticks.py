@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Ticks get lost between device and controller, which must not take that for a broken wheel."""
+"""Lost ticks between device and controller do not look like wheel faults."""
 
 from collections import deque
 from contextlib import suppress
@@ -24,15 +24,14 @@ SEEDS = range(6)
 def run(loop: ClosedLoop, seed: int, seconds: float, loss: float, longest: int, device: bool
         ) -> None:
     """
-    Hold estimator and controller, or the device, up now and then, from the first tick on.
+    Delay estimator and controller, or the device, at random from the first tick on.
 
-    Of the ticks meanwhile the last few wait for them, as they do in a subscription; the commands
-    for these come all at once, when their time has passed. A device that is held up leaves ticks
-    out, and its wheels keep their last command.
+    The last ticks of a delay wait in the subscription; their commands are sent together after the
+    delay. A delayed device skips ticks, and its wheels keep their last command.
 
-    :param loss: share of ticks at which they are held up.
-    :param longest: largest number of ticks.
-    :param device: who.
+    :param loss: share of ticks at which a delay begins.
+    :param longest: longest delay [ticks].
+    :param device: whether the device is delayed, or estimator and controller.
     """
     rng = np.random.default_rng(seed)
     away, waiting = 0, deque[tuple[int, Samples]](maxlen=5)
@@ -52,7 +51,7 @@ def run(loop: ClosedLoop, seed: int, seconds: float, loss: float, longest: int, 
         for then_ns, then in list(waiting):
             answer(loop, then_ns, then, stamp_ns)
         waiting.clear()
-        # Early, when the estimator still knows little.
+        # The device is armed early, when the covariance is still large.
         if not loop.supervisor.arming.armed:
             loop.supervisor.arm(stamp_ns, ())
         elif loop.controller.mode == 'hold' and tick % 100 == 0:
@@ -62,7 +61,7 @@ def run(loop: ClosedLoop, seed: int, seconds: float, loss: float, longest: int, 
 
 
 def answer(loop: ClosedLoop, stamp_ns: int, samples: Samples, now_ns: int) -> None:
-    """Let estimator and controller work on a tick, and the device take what comes of it."""
+    """Run estimator and controller for a tick, and send the command to the device."""
     loop.controller.device_armed(loop.supervisor.arming.armed)
     with suppress(RejectedError):
         for sample in samples.links:
@@ -83,7 +82,7 @@ def answer(loop: ClosedLoop, stamp_ns: int, samples: Samples, now_ns: int) -> No
 @pytest.mark.parametrize('command', ['effort', 'velocity'])
 @pytest.mark.parametrize(('loss', 'longest'), [(0.05, 5), (0.01, 40)])
 @pytest.mark.parametrize('device', [False, True], ids=['loop', 'device'])
-def test_healthy_wheels_stay_healthy(
+def test_lost_ticks_cause_no_wheel_fault(
     preset: str, command: str, loss: float, longest: int, device: bool,
 ) -> None:
     scenario = load_scenario(preset)

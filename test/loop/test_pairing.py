@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Two halves of a tick find each other, whatever the order and whatever was lost."""
+"""Pairing of two messages of a tick in any order and with lost messages."""
 
 from fourbar_ros.loop.stamp_pairing import DEPTH, LatenessDetector, StampPairs
 from hypothesis import given, settings
@@ -32,7 +32,7 @@ def test_same_half_twice_is_no_pair() -> None:
     assert pairs.complete(1, 'estimate', 'e') == {'wheels': 'new', 'estimate': 'e'}
 
 
-def test_older_ticks_are_given_up_once_a_newer_one_is_complete() -> None:
+def test_older_ticks_are_dropped_when_a_newer_one_is_complete() -> None:
     pairs = StampPairs()
     pairs.complete(1, 'wheels', 'one')
     pairs.complete(2, 'wheels', 'two')
@@ -43,10 +43,10 @@ def test_older_ticks_are_given_up_once_a_newer_one_is_complete() -> None:
 @settings(derandomize=True)
 @given(ahead=st.lists(st.integers(-DEPTH // 2, DEPTH // 2), min_size=1, max_size=60),
        lost=st.sets(st.tuples(st.integers(0, 59), st.sampled_from('ew'))))
-def test_each_tick_comes_once_and_time_rises(
+def test_each_tick_is_complete_once_and_in_order(
     ahead: list[int], lost: set[tuple[int, str]],
 ) -> None:
-    """Each topic keeps its order; one is ahead of the other by a few ticks; some get lost."""
+    """Each topic is in order; one leads the other by a few ticks; some messages are lost."""
     count = len(ahead)
     arrivals = []
     delay = 0.0
@@ -63,18 +63,18 @@ def test_each_tick_comes_once_and_time_rises(
     assert complete == [n for n in range(count) if not {(n, 'e'), (n, 'w')} & lost]
 
 
-def test_lost_halves_do_not_pile_up() -> None:
+def test_lost_halves_do_not_accumulate() -> None:
     pairs = StampPairs()
     for n in range(1000):
         assert pairs.complete(n, 'wheels', n) is None
-    # The newest of the thousand still waits, the first one does not.
+    # The newest of the thousand halves is kept, the first one is dropped.
     assert pairs.complete(0, 'estimate', 0) is None
     assert pairs.complete(999, 'estimate', 999) is not None
 
 
 @pytest.mark.parametrize('lost', [1, DEPTH, 3 * DEPTH])
 def test_device_that_starts_again_at_an_earlier_time_is_paired_again(lost: int) -> None:
-    """Halves without a partner, left from a run at later stamps, do not block the next run."""
+    """Halves of an earlier run with later stamps do not block the next run."""
     pairs = StampPairs()
     for n in range(lost):
         pairs.complete(10 ** 18 + n * PERIOD, 'wheels', n)
@@ -89,7 +89,7 @@ def test_device_that_starts_again_at_an_earlier_time_is_paired_again(lost: int) 
 
 
 def lateness(delays_ms: list[float], drift: float = 0.0) -> list[bool]:
-    """Let ticks come so late, by a clock that drifts and began at another time."""
+    """Return whether ticks with these delays are late, for a clock with offset and drift."""
     lateness = LatenessDetector()
     return [lateness.is_late(
         n * PERIOD, 10 ** 15 + round((n * PERIOD + delay * 1e6) * (1.0 + drift)))
@@ -97,7 +97,7 @@ def lateness(delays_ms: list[float], drift: float = 0.0) -> list[bool]:
 
 
 def test_tick_is_late_when_the_next_one_is_due() -> None:
-    # Held up for 22 ms: of the ticks that waited only the last ones are in time.
+    # After a delay of 22 ms only the last of the waiting ticks are in time.
     assert lateness([1.0, 0.5, 0.7, 22.0, 18.0, 14.0, 10.0, 6.0, 2.0, 0.6]) == (
         [False] * 3 + [True] * 5 + [False] * 2)
 
@@ -107,7 +107,7 @@ def test_clocks_that_drift_apart_make_no_tick_late(drift: float) -> None:
     assert not any(lateness([0.5] * 50_000, drift))
 
 
-def test_clock_that_starts_anew_begins_with_a_tick_in_time() -> None:
+def test_first_tick_after_a_restart_of_time_is_in_time() -> None:
     lateness = LatenessDetector()
     assert not lateness.is_late(10 ** 10, 0)
     assert not lateness.is_late(10 ** 9, 10 ** 12)

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A scenario runs as it is written, and its recording holds what the nodes would publish."""
+"""Runs of scenarios, and their records with the messages of the nodes."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -29,24 +29,23 @@ PERIOD_NS = 4_000_000
 
 
 @pytest.mark.parametrize('name', ['paper', 'prototype'])
-def test_preset_makes_its_quarter_turn(name: str) -> None:
+def test_preset_completes_its_quarter_turn(name: str) -> None:
     scenario = load_scenario(name)
     found = record_run(scenario).arrays()
     stamps = found['sim/link_states.stamp_ns']
     assert stamps[-1] - stamps[0] == scenario.duration * 1e9
     true, wanted = found['sim/link_states.position'], found['reference.position']
     assert np.abs(true[-1] - true[0] - pi / 2).max() < HALF_A_DEGREE
-    # From the first command on: before, the reference is the estimate.
-    # Ticks before the first sample arrived have none.
+    # The reference is the estimate before the first command, and missing before the first sample.
     assert np.abs((wanted - true[-len(wanted):])[100:]).max() < HALF_A_DEGREE
-    # Peak of the soft step's rate times inertia of a pair, by two wheels; the prototype's number
-    # is that of its file. Friction in the joints moves momentum between its pairs, so it is the
-    # mean of both.
+    # The peak is the peak rate of the soft step times the inertia of a pair, by two wheels, from
+    # the file of the mechanism. Joint friction moves momentum between the pairs of the prototype,
+    # so the test takes the mean of all wheels.
     speeds = found['sim/flywheel_states.velocity']
     peak = np.abs(speeds.mean(axis=1)).max()
     assert peak == pytest.approx({'paper': 62.37, 'prototype': 48.0}[name], rel=0.05)
     assert np.abs(speeds).max() < 1.3 * peak
-    # How its command is written: of what a message leaves out there is no number.
+    # The record has NaN for fields that the commands omit.
     given, left_out = ('effort', 'velocity') if name == 'paper' else ('velocity', 'effort')
     driven = found[f'flywheel_command.{given}'][100:]
     assert np.isfinite(driven).all()
@@ -54,8 +53,8 @@ def test_preset_makes_its_quarter_turn(name: str) -> None:
 
 
 @pytest.mark.parametrize('heading', ['link_a', 'link_d'])
-def test_joint_encoders_and_one_heading_serve_as_well(heading: str) -> None:
-    """The prototype makes its turn with sensors of the other kind."""
+def test_prototype_with_joint_encoders_and_one_heading(heading: str) -> None:
+    """The estimate of the turn is as accurate with sensors of the other kind."""
     scenario = load_scenario('prototype')
     sensors = replace(scenario.table.link_sensors, kind='joint', heading=heading)
     scenario = replace(scenario, table=replace(scenario.table, link_sensors=sensors))
@@ -63,7 +62,7 @@ def test_joint_encoders_and_one_heading_serve_as_well(heading: str) -> None:
     found = recording.arrays()
     true, estimate = found['sim/link_states.position'], found['estimate/link_states.position']
     assert np.abs(true[-1] - true[0] - pi / 2).max() < HALF_A_DEGREE
-    # The noise of one sample.
+    # The error is below the noise of one sample.
     assert np.abs((estimate - true[-len(estimate):])[100:]).max() < sensors.noise_rms
     names, table = recording.table()
     innovations = table[:, [names.index(f'innovation_{name}') for name in (
@@ -72,7 +71,7 @@ def test_joint_encoders_and_one_heading_serve_as_well(heading: str) -> None:
 
 
 def strong_scenario() -> Scenario:
-    """Give the linkage of the paper motors that bear moves within half a second."""
+    """Return a scenario with motors strong enough for moves within half a second."""
     scenario = load_scenario('paper')
     strong = replace(scenario.mechanism, motor_torque_limits=np.full(4, 1e-2),
                      motor_speed_limits=np.full(4, 5e4))
@@ -85,16 +84,16 @@ def test_script_acts_from_the_next_tick_on() -> None:
         setpoints=(ScriptedSetpoint(0.199, ('link_a',), (0.1,), 0.2),))
     found = record_run(scenario).arrays()
     commanded = np.flatnonzero(found['flywheel_command.effort'].any(axis=1))
-    # Tick 25 is at 0.1 s; the device is armed after it, and the next tick has the first torque.
+    # The device is armed after tick 25 at 0.1 s, and the next tick has the first torque.
     assert commanded[0] == 26
     moving = np.flatnonzero(found['reference.velocity'].any(axis=1))
-    # Tick 50 is the first after 0.199 s, and the move is over after 50 more.
+    # Tick 50 is the first after 0.199 s, and the move ends after 50 more.
     assert moving[0] == 51
     assert moving[-1] == 99
     assert found['reference.position'][-1, 0] == 0.1
 
 
-def test_duration_of_a_setpoint_holds_for_it_alone() -> None:
+def test_duration_of_a_setpoint_applies_to_no_other_one() -> None:
     base = strong_scenario()
     scenario = replace(
         base, arm_at=0.1, duration=1.0,
@@ -105,7 +104,7 @@ def test_duration_of_a_setpoint_holds_for_it_alone() -> None:
     assert np.flatnonzero(moving).tolist() == [*range(51, 75), *range(101, 200)]
 
 
-def test_what_lies_behind_the_end_does_not_happen() -> None:
+def test_setpoint_after_the_end_has_no_effect() -> None:
     scenario = replace(load_scenario('paper'), duration=0.2)
     steps = list(run_scenario(scenario))
     assert len(steps) == 51
@@ -122,7 +121,7 @@ def test_refused_setpoint_ends_the_run_and_names_the_entry(
         list(run_scenario(scenario))
 
 
-def test_device_that_refuses_to_be_armed_ends_the_run(
+def test_refused_arming_ends_the_run(
     monkeypatch: pytest.MonkeyPatch, refuses: Callable[..., AbstractContextManager[None]],
 ) -> None:
     monkeypatch.setattr(ClosedLoop, 'arm', lambda _: (False, 'refused: no sample from link_b'))
@@ -141,7 +140,7 @@ def test_same_seed_same_bytes(name: str) -> None:
 
 # The recording
 
-def test_recording_is_what_the_steps_hold() -> None:
+def test_record_has_the_values_of_the_steps() -> None:
     scenario = replace(load_scenario('paper'), duration=0.1)
     steps = list(run_scenario(scenario))
     found = record_run(scenario).arrays()
@@ -156,19 +155,19 @@ def test_recording_is_what_the_steps_hold() -> None:
         'flywheel_command.effort': [step.control.torques for step in steps if step.control]}
     for name, rows in wanted.items():
         np.testing.assert_array_equal(found[name], rows, err_msg=name)
-    # No innovation at the tick that starts the filter.
+    # The tick that starts the filter has no innovation.
     assert len(found['estimate/innovation.position']) == len(steps) - 1
     np.testing.assert_array_equal(
         found['estimate/innovation.tick_ns'], found['flywheel_states.stamp_ns'][1:])
 
 
 def thinned(step: Step, samples: tuple[LinkSample, ...]) -> Step:
-    """Give a step other samples of the links."""
+    """Return a step with other samples of the links."""
     return replace(step, samples=replace(step.samples, links=samples))
 
 
-def test_what_was_not_there_stays_empty() -> None:
-    """Ticks without samples, with one of two links, and with two of different stamps."""
+def test_missing_samples_are_missing_in_the_record() -> None:
+    """The ticks have no sample, one sample of two links, and two samples of different stamps."""
     scenario = replace(load_scenario('paper'), duration=0.012)
     steps = list(run_scenario(scenario))
     first_ns = steps[0].samples.stamp_ns
@@ -220,8 +219,8 @@ def test_steps_pass_through_the_progress_display() -> None:
     assert seen == [6, *recording.tick_stamps_ns]
 
 
-def test_command_of_a_wheel_without_power_stays_empty() -> None:
-    """Neither torque nor speed, while the others have theirs; an unarmed loop commands torques."""
+def test_command_of_a_wheel_without_power_is_missing_in_the_record() -> None:
+    """The other wheels have a speed command; a disarmed loop commands torques."""
     scenario = replace(load_scenario('prototype'), duration=0.02)
     steps = list(run_scenario(scenario))[-2:]
     values, powered = np.array([1.0, 2.0, 3.0, 4.0]), np.array([True, False, True, True])

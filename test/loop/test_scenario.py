@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Scenario files: their contents, their defaults, and errors that name key, value and limit."""
+"""Scenario files: contents, defaults, and errors with key, value and limit."""
 
 from collections.abc import Callable
 from copy import deepcopy
@@ -42,7 +42,7 @@ def written(tmp_path: Path) -> Write:
 
 
 def changed(place: str, value: Any) -> dict[str, Any]:
-    """Return the good scenario with one value changed, or dropped if it is `...`."""
+    """Return the good scenario with one changed value; `...` removes it."""
     content = deepcopy(GOOD)
     *sections, name = [int(key) if key.isdigit() else key for key in place.split('.')]
     section: Any = content
@@ -56,7 +56,7 @@ def changed(place: str, value: Any) -> dict[str, Any]:
 
 
 def test_presets_are_the_papers_manoeuvre() -> None:
-    """Links a and b from 0 and 60 degrees, by a quarter turn in ten seconds, at rest, open."""
+    """The links a and b turn by 90 degrees in ten seconds, from 0 and 60 degrees at rest."""
     assert {'paper', 'prototype'} <= set(presets('scenario'))
     for name in ('paper', 'prototype'):
         scenario = load_scenario(name)
@@ -68,11 +68,11 @@ def test_presets_are_the_papers_manoeuvre() -> None:
         assert dict(zip(setpoint.names, setpoint.positions)) == {
             'link_a': pi / 2, 'link_b': pi / 3 + pi / 2}
         assert setpoint.duration == 10.0
-        # What comes after the end of the move shows whether it stays.
+        # The run continues for a second after the move.
         assert scenario.duration >= setpoint.at + 10.0 + 1.0
 
 
-def test_everything_is_taken_over(written: Write) -> None:
+def test_all_values_are_read(written: Write) -> None:
     scenario = load_scenario(written(GOOD))
     assert (scenario.seed, scenario.duration, scenario.arm_at) == (3, 2.0, 0.3)
     assert scenario.plant.rate == 500.0
@@ -88,7 +88,7 @@ def test_everything_is_taken_over(written: Write) -> None:
     assert second.positions == (start[3] - 1.0,)
 
 
-def test_script_may_be_left_out(written: Write) -> None:
+def test_events_may_be_missing(written: Write) -> None:
     content = deepcopy(GOOD)
     for name in ('plant', 'estimator', 'controller', 'arm_at', 'setpoints'):
         del content[name]
@@ -102,7 +102,7 @@ def test_both_ends_of_the_duration_are_ticks(written: Write) -> None:
     assert scenario.ticks == 1001
     assert replace(scenario, duration=0.0019).ticks == 1
     assert replace(scenario, duration=0.0021).ticks == 2
-    # 0.3 s in floating point is no whole number of periods of 2 ms, but meant as one.
+    # 0.3 s is a whole number of periods of 2 ms within rounding.
     assert scenario.tick_at(0.3) == 150
     assert scenario.tick_at(0.3001) == 151
     assert scenario.tick_at(0.0) == 0
@@ -160,28 +160,28 @@ def test_model_may_be_another_preset_or_a_path_from_the_file(
 
 
 def heavier_wheels() -> str:
-    """Return the paper's mechanism with wheels of 4e-7 kg m^2."""
+    """Return the mechanism of the paper with wheels of 4e-7 kg m^2."""
     text = (share_directory() / 'config' / 'mechanism_paper.yaml').read_text()
     return text.replace('3.4e-7', '4.0e-7')
 
 
-# What the nodes get
+# Parameters of the nodes
 
 def checked(parameters: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Let the nodes' own tables check the values."""
+    """Check the values by the tables of the nodes."""
     rows = {node: {row.name: row for row in table} for node, table in TABLES.items()}
     return {node: {name: rows[node][name].check(value) for name, value in values.items()}
             for node, values in parameters.items()}
 
 
 @pytest.mark.parametrize('name', ['paper', 'prototype'])
-def test_parameters_of_the_presets_are_good_for_the_nodes(name: str) -> None:
+def test_parameters_of_the_presets_are_valid_for_the_nodes(name: str) -> None:
     parameters = load_scenario(name).parameters()
     assert set(parameters) == {'plant', 'estimator', 'controller'} <= set(TABLES)
     assert checked(parameters) == parameters
 
 
-def test_parameters_say_what_the_file_says(written: Write) -> None:
+def test_parameters_agree_with_the_file(written: Write) -> None:
     parameters = load_scenario(written(GOOD)).parameters()
     assert parameters['plant']['rate'] == 500.0
     assert parameters['plant']['seed'] == 3
@@ -214,7 +214,7 @@ def test_defaults_are_those_of_the_nodes(written: Write) -> None:
             if name == 'seed':
                 continue
             if isinstance(value, float):
-                # The nodes round pi / 3 to twelve digits.
+                # The tables of the nodes round pi / 3 to twelve digits.
                 assert value == pytest.approx(rows[node, name].default, abs=1e-12), name
             else:
                 assert value == rows[node, name].default, name
@@ -279,7 +279,7 @@ def test_number_of_another_type_or_out_of_range(place: str, value: Any, written:
     ('setpoints.1.relative', 0.5, 'relative', dict),
     ('setpoints.1.at', 2.5, 'setpoints, entry 2: at', (0.0, 2.0)),
     ('setpoints.1.duration', 0.0, 'setpoints, entry 2: duration', (0.1, 3600.0)),
-    # Not after the entry before, and not after arming.
+    # The time is not after the previous entry, or not after arming.
     ('setpoints.1.at', 0.5, 'at', 0.5),
     ('setpoints.0.at', 0.3, 'at', 0.3)])
 def test_wrong_value(place: str, value: Any, name: str, limit: Any, written: Write) -> None:
@@ -356,7 +356,7 @@ def test_replaced_values_are_checked_too(change: dict[str, Any], written: Write)
 
 
 def plain(scenario: Scenario) -> dict[str, Any]:
-    """Return what a scenario holds as text that tells any two apart, names of files left out."""
+    """Return the contents of a scenario as text, without the names of files."""
     def text(value: Any) -> str:
         return repr({item.name: text(getattr(value, item.name)) for item in fields(value)}
                     if is_dataclass(value) else
@@ -367,7 +367,7 @@ def plain(scenario: Scenario) -> dict[str, Any]:
 
 @pytest.mark.parametrize('name', presets('scenario'))
 def test_description_makes_the_same_scenario(name: str) -> None:
-    """Written to YAML and read again it is still the same, whatever the folder."""
+    """A description that is written to YAML in any folder and read again is the same scenario."""
     description = load_description(name)
     again = scenario_from(yaml.safe_load(yaml.safe_dump(description)), Path('nowhere'))
     assert plain(again) == plain(load_scenario(name))

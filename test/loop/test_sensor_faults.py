@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sensors fail during a manoeuvre of the prototype: the estimate stands it, and names them."""
+"""Sensor faults during a manoeuvre: bounded error of the estimate, and isolation."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,7 +18,7 @@ import pytest
 
 PERIOD_S = 4e-3
 SETPOINT_S, FASTEST_S, END_S = 1.0, 3.0, 5.5
-# No error of an angle beyond this, whatever one sensor does.
+# Largest error of an angle with any fault of one sensor [rad].
 LARGEST_ERROR = radians(1.0)
 NAMED_WITHIN_S = 2.0
 
@@ -33,7 +33,7 @@ def scenario() -> Scenario:
 
 
 def quarter_turn(loop: ClosedLoop) -> Iterator[tuple[float, Step]]:
-    """Go through a quarter turn of both pairs in 4 s, fastest in the middle."""
+    """Run a quarter turn of both pairs in 4 s, with the peak rate in the middle."""
     loop.controller.settings = ControllerSettings(setpoint_duration=4.0)
     for tick in range(round(END_S / PERIOD_S)):
         step = loop.step()
@@ -56,10 +56,10 @@ def error_of(step: Step) -> float:
 
 @pytest.mark.parametrize(('link', 'kind', 'value'), [
     (n % 4, *fault) for n, fault in enumerate(FAULTS)])
-def test_one_that_fails_does_little_and_is_named(
+def test_fault_of_one_sensor_is_isolated_and_the_error_is_small(
     link: int, kind: str, value: float | None, scenario: Scenario,
 ) -> None:
-    """In the fastest moment, and only it."""
+    """The fault begins at the peak rate, and no other sensor is reported."""
     name = LINK_NAMES[link]
     loop = make_loop(replace(scenario, seed=10 + link))
     named_s, worst = inf, 0.0
@@ -80,7 +80,7 @@ def test_one_that_fails_does_little_and_is_named(
 
 
 @pytest.mark.parametrize('seed', range(2))
-def test_wheels_alone_carry_it_for_a_second_and_then_it_says_that_it_is_lost(
+def test_wheels_alone_drive_the_estimate_for_a_second_until_it_is_lost(
     seed: int, scenario: Scenario,
 ) -> None:
     loop = make_loop(replace(scenario, seed=seed))

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The paper's quarter turn by four wheels and by two: half the speed, energy and eq. 9."""
+"""Quarter turn of the paper with four and with two wheels: speeds, energy and eq. 9."""
 
 from dataclasses import replace
 from math import pi
@@ -15,16 +15,16 @@ import pytest
 
 Recorded = dict[str, NDArray[np.float64]]
 
-# Of the soft step, the largest rate times duration over distance.
+# Peak rate of the soft step times duration over distance.
 PEAK_RATE = 15.0 / 8.0
-# Ticks miss the peak by at most 2 ms, 3e-7 of it. Torque that is held for 4 ms is late by 2 ms,
-# 2e-4 of the 10 s, and feedback makes good for that.
+# Relative tolerance: ticks miss the peak by at most 2 ms, which is 3e-7 of it. Torque held for
+# 4 ms is late by 2 ms, 2e-4 of the 10 s, and the feedback compensates for that.
 CLOSE = 1e-3
 
 
 @pytest.fixture(scope='module')
 def quarter_turn() -> Scenario:
-    """Return the paper's scenario with sensors that tell the truth, which the filter believes."""
+    """Return the scenario of the paper with exact sensors and the matching filter settings."""
     scenario = load_scenario('paper')
     table = replace(
         scenario.table,
@@ -36,14 +36,14 @@ def quarter_turn() -> Scenario:
 
 @pytest.fixture(scope='module')
 def runs(quarter_turn: Scenario) -> dict[str, Recorded]:
-    """Run it by each way to share."""
+    """Run the scenario with each allocation."""
     return {allocation: record_run(replace(quarter_turn, controller=replace(
         quarter_turn.controller, allocation=allocation))).arrays()
         for allocation in ('min_norm', 'two_wheels')}
 
 
 def absolute_speeds(run: Recorded) -> NDArray[np.float64]:
-    """Return those of the wheels (ticks, 4) [rad/s]."""
+    """Return the absolute wheel speeds (ticks, 4) [rad/s]."""
     return run['sim/flywheel_states.velocity'] + run['sim/link_states.velocity']
 
 
@@ -52,8 +52,8 @@ def energy(run: Recorded, name: str) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize('allocation', ['min_norm', 'two_wheels'])
-def test_both_make_the_turn_and_nothing_else(allocation: str, runs: dict[str, Recorded]) -> None:
-    """Otherwise it would be no wonder that one of them needs less."""
+def test_both_allocations_make_the_turn(allocation: str, runs: dict[str, Recorded]) -> None:
+    """The comparison of the wheels needs equal motions."""
     angles = runs[allocation]['sim/link_states.position']
     np.testing.assert_allclose(angles[-1] - angles[0], pi / 2.0, rtol=0.0, atol=1e-3)
     theta = angles[:, 1] - angles[:, 0]
@@ -64,7 +64,7 @@ def test_both_make_the_turn_and_nothing_else(allocation: str, runs: dict[str, Re
 def test_wheels_take_the_momentum_of_their_pair(
     allocation: str, of_a_pair: int, quarter_turn: Scenario, runs: dict[str, Recorded],
 ) -> None:
-    """The turn of the whole is that of both pairs alike: A is a multiple of the identity."""
+    """Both pairs turn equally, since A is a multiple of the identity."""
     mechanism = quarter_turn.mechanism
     form = reduced_form(mechanism, assemble(mechanism, 0.0, pi / 3.0), [0.0, 0.0])
     momentum = form.mass_matrix[0, 0] * PEAK_RATE * (pi / 2.0) / 10.0

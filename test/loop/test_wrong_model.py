@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The prototype moves and rests as it should with a model of it that is 5 % wrong."""
+"""Tracking errors and behaviour at rest of the prototype with a model that is 5 % wrong."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ LARGEST_RMS, LARGEST_AT_THE_END, LARGEST_SWING = 0.15, 0.1, 0.12
 
 def tracking(links: float, wheels: float, by: tuple[float, float]) -> Array:
     """
-    Make one move on the table with friction, drag, tilt and late sensors, and then rest.
+    Run one move and a rest on the table with friction, drag, tilt and sensor latency.
 
-    :param links, wheels: inertias that the controller believes in, as shares of the true ones.
+    :param links, wheels: inertias of the model as shares of the true ones.
     :param by: travel of links a and b [rad].
-    :returns: (ticks, 4) reference less true angles [deg].
+    :returns: reference minus true angles (ticks, 4) [deg].
     """
     scenario = load_scenario('prototype')
     true = scenario.mechanism
@@ -60,10 +60,10 @@ def tracking(links: float, wheels: float, by: tuple[float, float]) -> Array:
 @pytest.mark.slow
 @pytest.mark.parametrize('by', [(pi / 2, pi / 2), (0.0, pi / 4)], ids=['whole', 'configuration'])
 @pytest.mark.parametrize(('links', 'wheels'), [(1.05, 0.95), (0.95, 1.05)])
-def test_errors_stay_small_and_at_rest_it_does_not_hunt(
+def test_errors_stay_small_and_at_rest_there_is_no_limit_cycle(
     links: float, wheels: float, by: tuple[float, float],
 ) -> None:
-    """Both inertias wrong to different sides, which makes most of the wrong torque."""
+    """The two inertias have errors of opposite signs, which is the largest torque error."""
     errors = tracking(links, wheels, by)
     begin, end = round((BEGIN + 0.01) * RATE), round((BEGIN + DURATION + SETTLING) * RATE)
     assert np.sqrt((errors[begin:end] ** 2).mean(axis=0)).max() <= LARGEST_RMS

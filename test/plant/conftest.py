@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A plant that stands still unless told otherwise, with perfect sensors."""
+"""A plant with perfect sensors, at rest by default."""
 
 from collections.abc import Callable
 
@@ -18,7 +18,7 @@ PERFECT = Table(LinkSensorSettings(), WheelEncoders(0))
 
 @pytest.fixture(scope='session')
 def make_plant(paper: Mechanism) -> Callable[..., Plant]:
-    """Return a function that makes a plant, of the paper unless another linkage is given."""
+    """Return a function that makes a plant, by default of the linkage of the paper."""
     def make(mechanism: Mechanism = paper, table: Table = PERFECT,
              initial: InitialState = AT_REST, step_s: float = 5e-4, seed: int = 0) -> Plant:
         return Plant(mechanism, table, initial, step_s, np.random.default_rng(seed))

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The accounts of energy and momentum, and the edge of the table."""
+"""Energy budget and momentum of the plant, and the edge of the table."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -32,7 +32,7 @@ Refuses = Callable[..., AbstractContextManager[None]]
 
 MOVING = InitialState(0.3, 1.6, 'open', 1.0, -0.5)
 SENSORS = {'link_sensors': LinkSensorSettings(), 'wheel_encoders': WheelEncoders(0)}
-# Each effect by itself, and all of them.
+# Each effect alone, and all effects together.
 EFFECTS = {
     'none': {},
     'bearings': {'wheel_bearings': WheelBearings(2e-6, 1e-3, 1.3)},
@@ -57,7 +57,7 @@ def with_effect(name: str) -> Table:
 
 
 def driven(plant: Plant, seconds: float) -> Plant:
-    """Drive the wheels to and fro, seed 4."""
+    """Drive the wheels with sinusoidal torques of random phases, seed 4."""
     rng = np.random.default_rng(4)
     phase = rng.uniform(0.0, 6.0, 4)
     for n in range(round(seconds / 4e-3)):
@@ -68,10 +68,10 @@ def driven(plant: Plant, seconds: float) -> Plant:
 
 @pytest.mark.parametrize('compliant', [False, True], ids=['rigid', 'compliant'])
 @pytest.mark.parametrize('effect', list(EFFECTS))
-def test_accounts_balance(
+def test_energy_and_momentum_budgets_balance(
     effect: str, compliant: bool, prototype: Mechanism, make_plant: MakePlant,
 ) -> None:
-    """To 1e-6 of what changed hands; angular momentum to rounding, but for what drag takes."""
+    """The error is below 1e-6 of the exchanged energy and 1e-8 of the angular momenta."""
     linkage = prototype if not compliant else replace(
         prototype, joint_stiffness=np.full(4, 1e4), joint_damping=np.full(4, 2.0))
     plant = driven(make_plant(linkage, table=with_effect(effect), initial=MOVING), 4.0)
@@ -89,10 +89,10 @@ def test_accounts_balance(
             assert booked == 0.0
 
 
-def test_what_motors_work_becomes_energy_and_heat(
+def test_motor_work_becomes_energy_and_heat(
     prototype: Mechanism, make_plant: MakePlant,
 ) -> None:
-    """The supply gives exactly what windings lose and what links and wheels gain."""
+    """The energy of the supply is the copper loss plus the energy of links and wheels."""
     plant = make_plant(prototype, table=with_effect('none'))
     plant.advance(1000, np.array([2e-3, -1e-3, 1e-3, 3e-3]))
     ledger = plant.ledger()
@@ -101,8 +101,8 @@ def test_what_motors_work_becomes_energy_and_heat(
     assert ledger.links_spin == pytest.approx(-ledger.wheels_spin, rel=1e-9)
 
 
-def test_tilted_table_lets_it_slide(prototype: Mechanism, make_plant: MakePlant) -> None:
-    """By g sin(tilt), and the height lost is the energy of the motion."""
+def test_linkage_slides_on_a_tilted_table(prototype: Mechanism, make_plant: MakePlant) -> None:
+    """The acceleration is g sin(tilt), and the lost potential energy is kinetic energy."""
     plant = make_plant(prototype, table=with_effect('tilt'))
     plant.advance(4000, np.zeros(4))
     truth, pull = plant.truth(), 9.80665 * np.sin([1e-3, -2e-3])
@@ -115,7 +115,7 @@ def test_tilted_table_lets_it_slide(prototype: Mechanism, make_plant: MakePlant)
 def test_joint_friction_moves_momentum_between_the_pairs_only(
     prototype: Mechanism, make_plant: MakePlant,
 ) -> None:
-    """It stops the change of configuration; the whole keeps turning."""
+    """Friction stops the change of configuration, and the whole keeps turning."""
     plant = make_plant(prototype, table=with_effect('joints'),
                        initial=InitialState(0.3, 1.6, 'open', 0.3, 0.0))
     spin = plant.ledger().links_spin
@@ -129,7 +129,7 @@ def test_joint_friction_moves_momentum_between_the_pairs_only(
 def test_disturbances_are_white_torques_of_the_density_asked_for(
     prototype: Mechanism, make_plant: MakePlant,
 ) -> None:
-    """Seed 0; variance of the angular momentum = 4 links density^2 time, four standard errors."""
+    """The variance of the angular momentum is 4 density^2 time, within four standard errors."""
     density, runs = 1e-4, 400
     plant = make_plant(prototype, table=Table(**SENSORS, disturbance=Disturbance(density)))
     gained = []
@@ -147,9 +147,9 @@ def test_disturbances_walk_with_the_density_asked_for(
     prototype: Mechanism, make_plant: MakePlant,
 ) -> None:
     """
-    Seed 0; increments and, seeds 0 to 199, where the walk begins, within four standard errors.
+    Increments (seed 0) and begin (seeds 0 to 199) agree within four standard errors.
 
-    What the walking torques give the links is what they say of themselves.
+    The impulse on the links is that of the reported torques.
     """
     density, draws, period = 2e-4, 1000, 4e-3
     table = Table(**SENSORS, disturbance=Disturbance(torque_walk=density))
@@ -173,10 +173,10 @@ def test_disturbances_walk_with_the_density_asked_for(
     assert abs(np.square(begins).mean() - 1.0) < 4.0 * np.sqrt(2.0 / 400)
 
 
-def test_walk_is_drawn_after_the_white_torques_and_goes_on_over_a_reset(
+def test_walk_is_drawn_after_the_white_torques_and_continues_after_a_reset(
     prototype: Mechanism, make_plant: MakePlant,
 ) -> None:
-    """Without it a table draws what it always drew; a linkage put back finds it where it was."""
+    """The walk does not change the white torques, and a reset does not restart it."""
     white, both = (make_plant(prototype, table=Table(**SENSORS, disturbance=made)) for made in (
         Disturbance(1e-4), Disturbance(1e-4, 2e-4)))
     for plant in (white, both):
@@ -191,10 +191,10 @@ def test_walk_is_drawn_after_the_white_torques_and_goes_on_over_a_reset(
 
 
 @pytest.mark.parametrize('restitution', [0.0, 0.5, 1.0])
-def test_joint_that_meets_the_edge_leaves_as_the_restitution_says(
+def test_contact_with_the_edge_has_the_restitution(
     restitution: float, prototype: Mechanism, make_plant: MakePlant,
 ) -> None:
-    """An impulse across the edge: momentum along it stays, what is missing of energy is booked."""
+    """The impulse is normal to the edge, and the budget contains the lost energy."""
     surface = Surface(size_x=0.5, restitution=restitution)
     plant = make_plant(prototype, table=Table(**SENSORS, surface=surface), initial=MOVING)
     plant._state[18:20] = [0.3, 0.1]
@@ -212,12 +212,12 @@ def test_joint_that_meets_the_edge_leaves_as_the_restitution_says(
         plant.advance(1, np.zeros(4))
     after, ledger = outward(), plant.ledger()
     hit = int(np.argmax(before - after))
-    # One step of motion lies between the two looks: 5e-4 s times an acceleration of order one.
+    # One step lies between the two states: 5e-4 s times an acceleration of order one.
     assert after[hit] == pytest.approx(-restitution * before[hit], abs=2e-3)
     momentum = linear_momentum(prototype, plant._state)
     assert momentum[1] == pytest.approx(before_momentum[1], rel=1e-12)
     assert momentum[0] < before_momentum[0]
-    # The impulse acts at the edge: its moment about the origin is what the spin has changed by.
+    # The moment of the impulse about the origin is the change of the angular momentum.
     joint_levers(hit, plant._state, prototype.constants, lever)
     place = plant._state[16:18] + lever.sum(axis=0)
     assert place[0] == pytest.approx(0.25, abs=1e-3)
@@ -227,8 +227,8 @@ def test_joint_that_meets_the_edge_leaves_as_the_restitution_says(
     assert np.abs(joint_gaps(prototype, plant._state)).max() < 1e-12
 
 
-def test_edge_holds_what_leans_on_it(prototype: Mechanism, make_plant: MakePlant) -> None:
-    """On a tilted table with a soft edge it comes to rest there, and no joint leaves the table."""
+def test_edge_holds_a_linkage_at_rest(prototype: Mechanism, make_plant: MakePlant) -> None:
+    """On a tilted table with a soft edge the linkage comes to rest on the table."""
     table = Table(**SENSORS, links=Links(0.5, 1e-2),
                   surface=Surface(tilt_x=0.02, size_x=0.8, size_y=0.8))
     plant = make_plant(prototype, table=table)
@@ -242,7 +242,7 @@ def test_edge_holds_what_leans_on_it(prototype: Mechanism, make_plant: MakePlant
     assert np.abs(plant.truth().centre_velocity).max() < 0.02
 
 
-def test_reset_opens_new_accounts(prototype: Mechanism, make_plant: MakePlant) -> None:
+def test_reset_restarts_the_budget(prototype: Mechanism, make_plant: MakePlant) -> None:
     plant = driven(make_plant(prototype, table=with_effect('all')), 0.2)
     plant.reset(MOVING)
     ledger = plant.ledger()
@@ -270,7 +270,7 @@ def test_drag_too_stiff_for_the_step_is_refused(
 
 
 def test_start_beyond_the_edge_is_refused(prototype: Mechanism, make_plant: MakePlant) -> None:
-    """By the joint, and how far; a reset to there changes nothing."""
+    """The error names the joint and the distance; a refused reset has no effect."""
     small = Table(**SENSORS, surface=Surface(size_x=0.55))
     with pytest.raises(PlantError) as refusal:
         make_plant(prototype, table=small, initial=InitialState(0.0, 0.3))
@@ -283,7 +283,7 @@ def test_start_beyond_the_edge_is_refused(prototype: Mechanism, make_plant: Make
 
 
 def test_shorter_steps_change_little(prototype: Mechanism, make_plant: MakePlant) -> None:
-    """Torques held over 4 ms, all effects but the random ones: a step of 0.5 ms is fine enough."""
+    """The step of 0.5 ms suffices for torques held over 4 ms and all deterministic effects."""
     still = replace(with_effect('all'), disturbance=Disturbance(), surface=Surface())
     ends = []
     for step in (5e-4, 1.25e-4):
@@ -292,6 +292,6 @@ def test_shorter_steps_change_little(prototype: Mechanism, make_plant: MakePlant
             plant.advance(round(4e-3 / step), 4e-3 * np.sin(4e-3 * n * np.array([1, 2, 3, 0.7])))
         ends.append(plant.truth())
     assert np.abs(ends[0].link_angles - ends[1].link_angles).max() < 1e-5
-    # Each reversal of a wheel, at most two here, is late by up to a step of static friction.
+    # Each of at most two reversals of a wheel is late by up to a step of static friction.
     late = 2 * 5e-4 * 1.3e-3 / 1.2e-4
     assert np.abs(ends[0].wheel_speeds - ends[1].wheel_speeds).max() < late

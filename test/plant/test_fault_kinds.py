@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What can break, how people write it, and what broken wheel drives become."""
+"""Kinds of faults, their text form, and the parameters of faulty wheel drives."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -42,7 +42,7 @@ def as_numbers(faults: WheelFaults) -> np.ndarray:
     return np.nan_to_num(np.array([getattr(faults, name) for name in ARRAYS]), nan=99.0)
 
 
-def test_the_faults_promised_are_there() -> None:
+def test_documented_faults_exist() -> None:
     assert set(SENSOR_FAULTS) == {
         'off', 'stuck', 'garbage', 'wrong', 'slow', 'delayed', 'intermittent'}
     assert set(WHEEL_FAULTS) == {
@@ -65,19 +65,19 @@ def test_a_value_survives_writing(value: float) -> None:
 
 
 @pytest.mark.parametrize('text', ['', '  ', 'none', ' none '])
-def test_none_is_health(text: str) -> None:
+def test_none_is_no_fault(text: str) -> None:
     assert parse_fault('flywheel_a', text) is None
 
 
 @pytest.mark.parametrize(('target', 'kind'), WITH_VALUE)
-def test_without_a_value_it_has_one_that_breaks_something(target: str, kind: str) -> None:
+def test_default_value_has_an_effect(target: str, kind: str) -> None:
     what = fault_kinds(target)[kind]
     healthy = 1.0 if kind == 'weak' else 0.0
     assert Fault(target, kind).value == what.default != healthy
 
 
 @pytest.mark.parametrize(('target', 'kind'), WITH_VALUE)
-def test_ends_of_the_range_are_taken(target: str, kind: str) -> None:
+def test_ends_of_the_range_are_accepted(target: str, kind: str) -> None:
     what = fault_kinds(target)[kind]
     for value in (what.low, what.high):
         assert Fault(target, kind, value).value == value
@@ -166,7 +166,7 @@ def test_a_fault_changes_one_number_of_one_wheel(
     np.testing.assert_array_equal(as_numbers(wheel_faults([fault])), expected)
 
 
-def test_healthy_wheels_do_what_they_are_told() -> None:
+def test_healthy_wheels_follow_their_commands() -> None:
     assert HEALTHY_WHEELS.torque_scale.tolist() == [1.0] * 4
     assert np.isnan(HEALTHY_WHEELS.forced_torque).all()
     assert np.isnan(HEALTHY_WHEELS.shorted_torque).all()

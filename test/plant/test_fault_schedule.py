@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults come and go at their time, and a schedule that cannot be followed is refused."""
+"""Begin and end of scheduled faults, and refused schedules."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -30,7 +30,7 @@ DEAD = {'at': 8.0, 'target': 'flywheel_a', 'fault': 'dead'}
 
 @pytest.fixture
 def board() -> FaultBoard:
-    """Make a board of four link sensors and four wheels, all well."""
+    """Make a board of four link sensors and four wheels without faults."""
     return FaultBoard(TARGETS)
 
 
@@ -38,26 +38,26 @@ def entry(**changed: Any) -> dict[str, Any]:
     return {**WRONG, **changed}
 
 
-def test_entries_arrive() -> None:
+def test_entries_are_read() -> None:
     assert parse_schedule([WRONG, DEAD], TARGETS, 'here') == (
         ScheduledFault(Fault('link_b', 'wrong', 0.1), 2 * S, 5 * S),
         ScheduledFault(Fault('flywheel_a', 'dead'), 8 * S, None))
 
 
-def test_without_a_value_the_kind_has_one() -> None:
+def test_missing_value_is_the_default_of_the_kind() -> None:
     scheduled, = parse_schedule([{**DEAD, 'fault': 'weak'}], TARGETS, 'here')
     assert scheduled.fault == Fault('flywheel_a', 'weak')
 
 
 def test_off_may_be_written_bare_in_yaml(tmp_path: Path) -> None:
-    """YAML 1.1 takes the word for false."""
+    """YAML 1.1 reads the word as false."""
     path = tmp_path / 'schedule.yaml'
     path.write_text('faults:\n  - {at: 1, target: link_a, fault: off}\n')
     scheduled, = parse_schedule(load_yaml(path)['faults'], TARGETS, 'here')
     assert scheduled.fault == Fault('link_a', 'off')
 
 
-def test_faults_come_and_go_at_their_time_to_the_nanosecond(board: FaultBoard) -> None:
+def test_faults_begin_and_end_at_their_time_to_the_nanosecond(board: FaultBoard) -> None:
     board.load([WRONG], 'here')
     wrong = Fault('link_b', 'wrong', 0.1)
     for elapsed_ns, changes, faults in [
@@ -80,7 +80,7 @@ def test_without_until_a_fault_stays(board: FaultBoard) -> None:
 
 
 def test_changes_come_in_the_order_of_their_times(board: FaultBoard) -> None:
-    """However long nobody asked, and however the entries are sorted."""
+    """The order depends neither on the interval of the calls nor on the order of the entries."""
     board.load([DEAD, entry(at=4, until=9), entry(at=1, until=4, fault='stuck', value=None),
                 entry(target='link_c', at=1, until=None)], 'here')
     assert [(change.elapsed_ns // S, change.target, change.fault and change.fault.kind)
@@ -90,7 +90,7 @@ def test_changes_come_in_the_order_of_their_times(board: FaultBoard) -> None:
     assert set(board.faults) == {'flywheel_a', 'link_c'}
 
 
-def test_a_fault_set_by_hand_counts_at_once_until_it_is_taken_away(board: FaultBoard) -> None:
+def test_fault_set_by_hand_acts_until_it_is_removed(board: FaultBoard) -> None:
     fault = Fault('link_a', 'off')
     board.set_fault('link_a', fault)
     assert board.faults == {'link_a': fault}
@@ -99,8 +99,8 @@ def test_a_fault_set_by_hand_counts_at_once_until_it_is_taken_away(board: FaultB
     assert not board.faults
 
 
-def test_scheduled_end_leaves_what_was_set_by_hand_meanwhile(board: FaultBoard) -> None:
-    """Even if it is the same once more."""
+def test_scheduled_end_keeps_a_fault_set_by_hand(board: FaultBoard) -> None:
+    """The fault set by hand is equal to the scheduled one."""
     board.load([WRONG], 'here')
     board.at_time(3 * S)
     by_hand = Fault('link_b', 'wrong', 0.1)
@@ -109,14 +109,14 @@ def test_scheduled_end_leaves_what_was_set_by_hand_meanwhile(board: FaultBoard) 
     assert board.faults == {'link_b': by_hand}
 
 
-def test_scheduled_end_of_what_was_mended_by_hand_is_no_change(board: FaultBoard) -> None:
+def test_scheduled_end_of_a_fault_removed_by_hand_is_no_change(board: FaultBoard) -> None:
     board.load([WRONG], 'here')
     board.at_time(3 * S)
     board.set_fault('link_b', None)
     assert board.at_time(6 * S) == ()
 
 
-def test_scheduled_beginning_replaces_what_was_set_by_hand(board: FaultBoard) -> None:
+def test_scheduled_begin_replaces_a_fault_set_by_hand(board: FaultBoard) -> None:
     board.load([WRONG], 'here')
     board.set_fault('link_b', Fault('link_b', 'off'))
     board.at_time(2 * S)
@@ -132,7 +132,7 @@ def test_new_schedule_replaces_the_old_one(board: FaultBoard) -> None:
     assert set(board.faults) == {'flywheel_a'}
 
 
-def test_refused_schedule_changes_nothing(board: FaultBoard) -> None:
+def test_refused_schedule_has_no_effect(board: FaultBoard) -> None:
     board.load([WRONG, DEAD], 'here')
     board.at_time(3 * S)
     with pytest.raises(FaultError):
@@ -142,7 +142,7 @@ def test_refused_schedule_changes_nothing(board: FaultBoard) -> None:
     assert set(board.faults) == {'flywheel_a'}
 
 
-def test_faults_can_be_seen_but_not_written(board: FaultBoard) -> None:
+def test_faults_are_read_only(board: FaultBoard) -> None:
     with pytest.raises(TypeError):
         board.faults['link_a'] = Fault('link_a', 'off')  # type: ignore[index]
 
@@ -196,7 +196,7 @@ def test_schedule_that_is_no_list_is_refused(bad: Any, refuses: Refuses) -> None
         parse_schedule(bad, TARGETS, 'run.yaml')
 
 
-def test_past_is_refused_and_now_is_not(refuses: Refuses) -> None:
+def test_entry_in_the_past_is_refused_and_one_at_present_is_not(refuses: Refuses) -> None:
     assert parse_schedule([WRONG], TARGETS, 'here', 2 * S)
     with refuses(FaultError, place='here, entry 1', name='at', value=2.0, limit=2.5):
         parse_schedule([WRONG], TARGETS, 'here', 2 * S + S // 2)

@@ -30,7 +30,7 @@ def table(**bearings: float) -> Table:
 
 @pytest.fixture
 def bench(paper: Mechanism) -> Mechanism:
-    """Make a linkage so heavy that its wheels turn as on a bench: it recoils by 1e-6."""
+    """Make a heavy linkage whose recoil is 1e-6, so that wheels turn as on a bench."""
     return replace(
         paper, link_lengths=np.full(4, 0.3), link_masses=np.full(4, 600.0),
         link_inertias=np.full(4, 120.0), com_positions=np.array([[0.15, 0.0]] * 4),
@@ -42,10 +42,10 @@ def speeds(plant: Plant) -> Array:
     return plant.truth().wheel_speeds
 
 
-def test_torque_that_lags_gives_the_impulse_of_a_first_order_lag(
+def test_lagging_torque_has_the_impulse_of_a_first_order_lag(
     bench: Mechanism, make_plant: MakePlant,
 ) -> None:
-    """The integral of T (1 - exp(-t / tau)), whatever the step."""
+    """The impulse is the integral of T (1 - exp(-t / tau)) for any step."""
     lag = np.array([3e-3, 1e-3, 1e-4, 0.0])
     for step in (5e-4, 2e-3):
         plant = make_plant(replace(bench, motor_time_constants=lag), step_s=step)
@@ -56,10 +56,10 @@ def test_torque_that_lags_gives_the_impulse_of_a_first_order_lag(
             1.2e-4 * (truth.wheel_speeds + truth.link_rates), 0.01 * passed, rtol=1e-12)
 
 
-def test_voltage_leaves_less_torque_the_faster_the_wheel(
+def test_voltage_limits_the_torque_in_proportion_to_the_speed(
     bench: Mechanism, make_plant: MakePlant,
 ) -> None:
-    """Towards V / k with the time constant R J / k^2, from a torque of k V / R at rest."""
+    """The speed approaches V / k with time constant R J / k^2; the torque at rest is k V / R."""
     constant, resistance, voltage = 0.05, 8.0, 6.0
     motor = replace(bench, motor_torque_constants=np.full(4, constant),
                     motor_resistances=np.full(4, resistance), motor_voltages=np.full(4, voltage))
@@ -69,12 +69,12 @@ def test_voltage_leaves_less_torque_the_faster_the_wheel(
         plant.advance(1000, np.array([0.05, -0.05, 0.05, 0.0]))
         time = 1000 * 1e-4 * (_ + 1)
         expected = voltage / constant * (1.0 - np.exp(-time / mechanical))
-        # Torque that is held over a step of 1e-4 s is late by half of it: 1e-4 of 0.38 s.
+        # Torque held over a step of 1e-4 s is late by half of it, 1e-4 of 0.38 s.
         np.testing.assert_allclose(
             speeds(plant), expected * np.array([1.0, -1.0, 1.0, 0.0]), rtol=1.5e-4, atol=1e-3)
 
 
-def test_windings_heat_up_by_the_square_of_the_current(
+def test_heat_of_windings_is_resistance_times_current_squared(
     bench: Mechanism, make_plant: MakePlant,
 ) -> None:
     motor = replace(bench, motor_torque_constants=np.array([0.05, 0.1, 0.05, 0.05]),
@@ -86,7 +86,7 @@ def test_windings_heat_up_by_the_square_of_the_current(
 
 
 def test_friction_depends_on_the_speed_alone_and_opposes_it(bench: Mechanism) -> None:
-    """Static at rest, half of the surplus at the Stribeck speed, then Coulomb and viscous."""
+    """Friction is static at rest, halfway to Coulomb at the Stribeck speed, then viscous too."""
     motors = drives_of(bench, WheelBearings(VISCOUS, COULOMB, RATIO, 2.0, 1e-4))
     for speed, expected in ((0.01, RATIO * COULOMB), (2.0, 1.15 * COULOMB + 2.0 * VISCOUS),
                             (300.0, COULOMB + 300.0 * VISCOUS)):
@@ -102,14 +102,14 @@ def test_friction_depends_on_the_speed_alone_and_opposes_it(bench: Mechanism) ->
 def test_wheel_stays_at_rest_below_static_friction(
     share: float, bench: Mechanism, make_plant: MakePlant,
 ) -> None:
-    """It creeps at less than the smoothing speed, and friction settles without chatter."""
+    """The wheel creeps below the smoothing speed, and the friction settles without chatter."""
     plant = make_plant(bench, table=Table(LinkSensorSettings(), WheelEncoders(0), DRY))
     torque = share * RATIO * COULOMB
     seen = []
     for _ in range(200):
         plant.advance(1, np.full(4, torque))
         seen.append(speeds(plant)[0])
-    # share = x / sqrt(x^2 + 1): the speed at which friction balances the motor.
+    # Friction balances the motor at the speed where share = x / sqrt(x^2 + 1).
     creep = 1e-4 * share / np.sqrt(1.0 - share * share)
     assert seen[-1] == pytest.approx(creep, rel=1e-3)
     steps = np.diff(seen) * np.sign(share)
@@ -124,18 +124,18 @@ def test_wheel_breaks_away_beyond_static_friction(
     plant.advance(8000, np.array([1.02, 0.98, 1.1, -1.1]) * RATIO * COULOMB)
     moved = np.abs(speeds(plant)) > 1.0
     assert moved.tolist() == [True, False, True, True]
-    # Once it turns it takes Coulomb friction only to keep it turning.
+    # A turning wheel needs no more than the Coulomb friction to turn on.
     before = speeds(plant)
     plant.advance(2000, np.array([1.02, 0.0, 1.02, -1.02]) * COULOMB)
     assert (np.abs(speeds(plant)) >= np.abs(before) - 1e-12)[[0, 2, 3]].all()
 
 
 @pytest.mark.parametrize('step', [1e-4, 5e-4, 2e-3])
-def test_wheel_runs_down_and_stays(step: float, bench: Mechanism, make_plant: MakePlant) -> None:
-    """Viscous and Coulomb friction: w(t) = (w0 + c/b) exp(-b t / J) - c/b, until it stands."""
+def test_wheel_coasts_to_rest(step: float, bench: Mechanism, make_plant: MakePlant) -> None:
+    """The speed is w(t) = (w0 + c/b) exp(-b t / J) - c/b until the wheel is at rest."""
     start, inertia = 20.0, 1.2e-4
     plant = make_plant(bench, table=table(coulomb=COULOMB, viscous=VISCOUS), step_s=step)
-    plant._state[12:16] = start     # by hand, as nothing else turns a wheel at once
+    plant._state[12:16] = start     # there is no other way to set a speed
     ratio = COULOMB / VISCOUS
     stops = inertia / VISCOUS * np.log((start + ratio) / ratio)
     expected = (start + ratio) * np.exp(-VISCOUS / inertia) - ratio
@@ -149,7 +149,7 @@ def test_wheel_runs_down_and_stays(step: float, bench: Mechanism, make_plant: Ma
 
 
 def test_friction_has_no_memory(make_plant: MakePlant, bench: Mechanism) -> None:
-    """A motion cut into pieces is the same to the last bit: all that counts is the state."""
+    """A motion in several calls has the same bits: friction depends on the state only."""
     rng = np.random.default_rng(3)
     commands = rng.uniform(-3e-3, 3e-3, (400, 4))
     bearings = table(coulomb=COULOMB, viscous=VISCOUS, static_ratio=RATIO)
@@ -164,17 +164,17 @@ def test_friction_has_no_memory(make_plant: MakePlant, bench: Mechanism) -> None
 def test_commanded_speed_is_reached_and_kept_against_friction(
     bench: Mechanism, make_plant: MakePlant,
 ) -> None:
-    """The integral learns the friction, and does not wind up while the motor is at its limit."""
+    """The integral compensates the friction and does not wind up at the torque limit."""
     plant = make_plant(bench, table=table(coulomb=COULOMB, viscous=VISCOUS, static_ratio=RATIO))
     wanted = np.array([100.0, -100.0, 10.0, 0.0])
-    # 0.05 N m / 1.2e-4 kg m^2 takes 0.24 s to 100 rad/s.
+    # With 0.05 N m and 1.2e-4 kg m^2 a wheel reaches 100 rad/s in 0.24 s.
     highest = np.zeros(4)
     for _ in range(300):
         plant.advance(8, wanted, by_speed=True)
         assert (np.abs(plant.truth().efforts) <= 0.05).all()
         highest = np.maximum(highest, speeds(plant) * np.sign(wanted))
     np.testing.assert_allclose(speeds(plant), wanted, rtol=0.0, atol=1e-3)
-    # From the limit in it does not overshoot by more than friction that it has yet to learn.
+    # The overshoot is only due to the friction that the integral does not compensate yet.
     assert (highest[:3] < np.abs(wanted[:3]) + 0.3).all()
     plant.advance(8, np.zeros(4))
     assert not plant.truth().efforts.any()

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the simulated table owes to physics, to its motors' limits and to its sensors."""
+"""Plant: conservation laws, motor limits, sensors, and refused settings."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -33,8 +33,8 @@ MakePlant = Callable[..., Plant]
 Refuses = Callable[..., AbstractContextManager[None]]
 
 STEP = 5e-4
-# 4000 steps (2 s), some ten roundings of 1.1e-16 each, all to the same side: 4.4e-12. The
-# truncation of a step, (3 rad/s * 5e-4 s)^5 / 120 = 6e-17, is less than one rounding.
+# 4000 steps (2 s) with ten roundings of 1.1e-16 of one sign are 4.4e-12. The truncation error
+# of a step, (3 rad/s * 5e-4 s)^5 / 120 = 6e-17, is less than one rounding.
 LONG = 4000
 DRIFT = 1e-11
 # Two-sided confidence of every statistical bound below.
@@ -61,13 +61,13 @@ def energy(plant: Plant) -> float:
 
 @pytest.fixture(params=['paper', 'uneven'])
 def mechanism(request: pytest.FixtureRequest) -> Mechanism:
-    """Take the paper's linkage, then one without any symmetry."""
+    """Return the linkage of the paper, then one without any symmetry."""
     linkage: Mechanism = request.getfixturevalue(request.param)
     return linkage
 
 
 @pytest.mark.parametrize('branch', ['open', 'crossed'])
-def test_without_torque_momentum_and_energy_stay(
+def test_without_torque_momentum_and_energy_are_constant(
     mechanism: Mechanism, branch: str, make_plant: MakePlant,
 ) -> None:
     plant = make_plant(mechanism, initial=replace(MOVING, branch=branch))
@@ -105,7 +105,7 @@ def test_work_of_the_motors_becomes_energy(mechanism: Mechanism, make_plant: Mak
     assert energy(plant) == pytest.approx(work, rel=0.04 ** 4 / 180.0 + DRIFT)
 
 
-def test_motor_limits_do_not_touch_momentum(mechanism: Mechanism, make_plant: MakePlant) -> None:
+def test_motor_limits_do_not_change_momentum(mechanism: Mechanism, make_plant: MakePlant) -> None:
     weak = replace(mechanism, motor_torque_limits=np.full(4, 2e-5),
                    motor_speed_limits=np.array([4.0, 2.0, 6.0, 500.0]))
     plant = make_plant(weak)
@@ -116,8 +116,8 @@ def test_motor_limits_do_not_touch_momentum(mechanism: Mechanism, make_plant: Ma
     assert abs(momentum(plant)) < DRIFT * moved
 
 
-def test_efforts_are_what_changed_the_wheels(mechanism: Mechanism, make_plant: MakePlant) -> None:
-    """Under every kind of command, the mean torque times the time is the change of momentum."""
+def test_efforts_are_changes_of_momentum(mechanism: Mechanism, make_plant: MakePlant) -> None:
+    """The mean torque times the time is the change of momentum, for every kind of command."""
     limited = replace(mechanism, motor_speed_limits=np.array([3.0, 3.0, 500.0, 500.0]))
     plant = make_plant(limited)
     rng = np.random.default_rng(1)
@@ -151,10 +151,10 @@ def test_speed_limit_blocks_torque_only_into_the_stop(
     limit = 20.0
     plant = make_plant(replace(paper, motor_speed_limits=np.full(4, limit)))
     drive = sign * np.array([1e-4, 0.0, 0.0, 0.0])
-    # 1e-4 N m / 3.4e-7 kg m^2 reaches 20 rad/s in 68 ms.
+    # With 1e-4 N m and 3.4e-7 kg m^2 a wheel reaches 20 rad/s in 68 ms.
     plant.advance(200, drive)
     speed = sign * plant.truth().wheel_speeds[0]
-    # One step may pass the limit, by what it adds (the link recoils by less than 1 % of it).
+    # The speed may pass the limit by that of one step (the recoil is less than 1 % of it).
     assert limit <= speed <= limit + 1.01 * 1e-4 / 3.4e-7 * STEP
     plant.advance(8, drive)
     assert plant.truth().efforts[0] == 0.0
@@ -184,7 +184,7 @@ def test_truth_is_a_copy(make_plant: MakePlant) -> None:
 
 
 @pytest.mark.parametrize('counts', [4, 1000, 16384])
-def test_samples_sit_on_the_grid_of_the_resolution(counts: int, make_plant: MakePlant) -> None:
+def test_samples_are_on_the_grid_of_the_resolution(counts: int, make_plant: MakePlant) -> None:
     step = 2.0 * pi / counts
     plant = make_plant(table=Table(LinkSensorSettings(), WheelEncoders(counts)),
                        initial=InitialState(0.7, 2.0, 'open', 1.0, 0.3))
@@ -194,8 +194,8 @@ def test_samples_sit_on_the_grid_of_the_resolution(counts: int, make_plant: Make
     assert (np.abs(errors) <= step / 2.0 * (1 + 1e-9)).all()
 
 
-def test_link_sensors_see_the_links(make_plant: MakePlant) -> None:
-    """Without errors they tell orientations and rates, in one turn."""
+def test_link_sensors_measure_the_links(make_plant: MakePlant) -> None:
+    """Sensors without errors measure orientations, wrapped to one turn, and rates."""
     gyros = LinkSensorSettings(gyro=True)
     plant = make_plant(table=Table(gyros, WheelEncoders(0)),
                        initial=InitialState(9.7, 11.0, 'open', 1.0, 0.3))
@@ -269,7 +269,7 @@ def test_initial_state_must_be_finite(
 def test_rates_at_a_change_point_are_refused(
     theta: float, paper: Mechanism, make_plant: MakePlant, refuses: Refuses,
 ) -> None:
-    """At rest it is a place to start from; moving, two rates do not determine the other two."""
+    """A start at rest is possible; with motion, two rates do not determine the other two."""
     rectangle = replace(paper, link_lengths=np.array([0.1, 0.05, 0.1, 0.05]))
     make_plant(rectangle, initial=InitialState(0.2, 0.2 + theta))
     with refuses(PlantError, limit=RATES_UNDETERMINED):
@@ -284,14 +284,14 @@ def test_initial_angles_that_cannot_close_are_refused(
         make_plant(long, initial=InitialState(0.0, 3.0))
 
 
-def test_initial_branch_is_one_that_can_be_assembled(
+def test_initial_branch_must_be_an_assembly(
     refuses: Refuses,
 ) -> None:
     with refuses(SettingError, name='initial.branch', value='folded', limit=BRANCHES):
         InitialState(branch='folded')
 
 
-def test_state_out_of_the_finite_numbers_is_an_error(
+def test_state_that_is_not_finite_is_an_error(
     paper: Mechanism, make_plant: MakePlant,
 ) -> None:
     plant = make_plant(replace(paper, motor_torque_limits=np.full(4, inf)))

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What link sensors make of the truth, when they say it, and what their faults do to it."""
+"""Link sensors: errors, timing, dropout and faults of their samples."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -27,8 +27,8 @@ Refuses = Callable[..., AbstractContextManager[None]]
 MS = 1_000_000
 S = 1000 * MS
 PERIOD = 4 * MS
-# Two-sided confidence of every statistical bound below. The seeds are fixed: what passes once
-# passes always.
+# Two-sided confidence of every statistical bound below. The seeds are fixed, so a test either
+# passes always or never.
 CONFIDENCE = 0.999
 NORMAL_BOUND = stats.norm.interval(CONFIDENCE)[1]
 SEED = 5
@@ -45,7 +45,7 @@ HEALTHY: Mapping[str, Fault] = {}
 
 @dataclass
 class Samples:
-    """What one sensor gave, in the order of measurement."""
+    """Samples of one sensor in the order of measurement."""
 
     stamps: NDArray[np.int64]
     ticks: NDArray[np.int64]
@@ -64,13 +64,13 @@ def fault(text: str, target: str = 'link_b') -> dict[str, Fault]:
 
 
 def at_rest(stamp_ns: int) -> Array:
-    """Return the angles of a linkage that does not move."""
+    """Return the angles of a linkage at rest."""
     return ANGLES
 
 
 def observe(sensors: LinkSensors, ticks: Sequence[int], truth: Callable[[int], Array] = at_rest,
             *, patience: int = 20 * S) -> list[tuple[int, LinkSample]]:
-    """Measure at every tick, and return with its tick all that ever arrived."""
+    """Measure at every tick, and return the samples with the ticks of their arrival."""
     readings = []
     for tick in ticks:
         sensors.measure(tick, truth(tick), RATES)
@@ -80,7 +80,7 @@ def observe(sensors: LinkSensors, ticks: Sequence[int], truth: Callable[[int], A
 
 
 def by_sensor(readings: Sequence[tuple[int, LinkSample]], name: str) -> Samples:
-    """Pick the samples of one sensor."""
+    """Return the samples of one sensor."""
     found = sorted((reading.stamp_ns, tick, *(
         values[reading.names.index(name)] if len(values) else nan
         for values in (reading.angles, reading.rates)))
@@ -109,7 +109,7 @@ def same(one: Samples, other: Samples) -> bool:
 
 
 def assert_normal(errors: Array, rms: float, what: str) -> None:
-    """Mean 0 and the rms, each within its confidence interval, and the shape of the bell."""
+    """Check the mean, the rms and the normal distribution of errors."""
     size = errors.size
     low, high = stats.chi2.interval(CONFIDENCE, size)
     assert low < float(errors @ errors) / rms ** 2 < high, f'{what}, seed {SEED}'
@@ -139,7 +139,7 @@ def test_noise_is_normal_with_the_rms_asked_for() -> None:
 
 
 def test_noise_is_white_and_each_sensor_has_its_own() -> None:
-    """No correlation in time up to 20 samples, and none between two sensors."""
+    """There is no correlation in time up to 20 samples, and none between two sensors."""
     samples = run(LinkSensorSettings(noise_rms=2e-3))
     noise = np.array([samples[name].angles for name in LINK_NAMES]).T - ANGLES
     noise /= 2e-3
@@ -164,7 +164,7 @@ def test_bias_is_added_to_all_or_to_each(key: str, bias: Any) -> None:
 
 @pytest.mark.parametrize('key', ['random_walk', 'gyro_random_walk'])
 def test_random_walk_grows_with_the_root_of_the_time_between_samples(key: str) -> None:
-    """Steps over uneven times, each over the root of its time, are one normal distribution."""
+    """Increments divided by the root of their time have one normal distribution."""
     walk = 3e-3
     uneven = np.random.default_rng(SEED).integers(1, 4000, COUNT) * MS
     ticks = [S + int(time) for time in np.cumsum(uneven)]
@@ -178,7 +178,7 @@ def test_random_walk_grows_with_the_root_of_the_time_between_samples(key: str) -
 
 @pytest.mark.parametrize('counts', [1, 2, 3, 4, 1000, 4095, 16384, 10 ** 6])
 @pytest.mark.parametrize('turns', [0, 1, -7, 1000])
-def test_samples_sit_on_the_nearest_count(counts: int, turns: int) -> None:
+def test_samples_are_on_the_nearest_count(counts: int, turns: int) -> None:
     step = 2.0 * pi / counts
     sensors = make(LinkSensorSettings(counts_per_turn=counts))
     sensors.measure(S, ANGLES + turns * 2.0 * pi, RATES)
@@ -186,7 +186,7 @@ def test_samples_sit_on_the_nearest_count(counts: int, turns: int) -> None:
     np.testing.assert_allclose(
         reading.angles / step, np.round(reading.angles / step), rtol=0.0, atol=1e-9)
     errors = np.angle(np.exp(1j * (reading.angles - ANGLES)))
-    # A thousand turns are known to 1e-12 rad.
+    # The rounding error of a thousand turns is 1e-12 rad.
     assert (np.abs(errors) <= step / 2.0 + 2e-12).all()
 
 
@@ -202,7 +202,7 @@ def test_samples_lie_in_one_turn(angle: float, counts: int) -> None:
     sample = sensors.due(S)[0].angles[0]
     assert -pi < sample <= pi
     if not counts:
-        # The turn itself is known to 1e-16 of it.
+        # The rounding error of a turn is 1e-16 of it.
         assert abs(np.exp(1j * sample) - np.exp(1j * angle)) < 1e-15 * max(10.0, abs(angle))
 
 
@@ -236,7 +236,7 @@ def test_joint_encoders_measure_the_second_link_relative_to_the_first(heading: s
             values, [b - a, c - b, d - c, a - d, own], rtol=1e-15, atol=atol)
 
 
-def test_joint_encoders_alone_read_the_same_however_the_whole_is_turned() -> None:
+def test_joint_encoders_do_not_depend_on_the_orientation_of_the_whole() -> None:
     sensors = make(LinkSensorSettings(kind='joint'))
     sensors.measure(S, ANGLES, RATES)
     sensors.measure(2 * S, ANGLES + 0.5, RATES)
@@ -254,7 +254,7 @@ def test_each_joint_encoder_has_its_own_bias() -> None:
 
 @pytest.mark.parametrize(('latency', 'ticks_later'), [
     (0.0, 0), (1e-9, 1), (3.999999e-3, 1), (4e-3, 1), (4.000001e-3, 2), (5e-3, 2), (0.1, 25)])
-def test_sample_goes_out_with_the_first_tick_at_or_after_its_latency(
+def test_sample_arrives_at_the_first_tick_at_or_after_its_latency(
     latency: float, ticks_later: int,
 ) -> None:
     readings = observe(make(LinkSensorSettings(latency=latency)), ticks_of(100))
@@ -264,7 +264,7 @@ def test_sample_goes_out_with_the_first_tick_at_or_after_its_latency(
     assert [reading.stamp_ns for _, reading in readings] == ticks_of(100)
 
 
-def test_sample_carries_the_time_and_the_truth_of_its_measurement() -> None:
+def test_sample_has_the_time_and_the_angle_of_its_measurement() -> None:
     def moving(stamp_ns: int) -> Array:
         return ANGLES * stamp_ns / (2 * S)
 
@@ -272,7 +272,7 @@ def test_sample_carries_the_time_and_the_truth_of_its_measurement() -> None:
         assert reading.angles.tobytes() == moving(reading.stamp_ns).tobytes()
 
 
-def test_a_sample_goes_out_once() -> None:
+def test_sample_arrives_once() -> None:
     sensors = make(LinkSensorSettings(latency=5e-3))
     sensors.measure(S, ANGLES, RATES)
     assert sensors.due(S + 5 * MS - 1) == ()
@@ -280,7 +280,7 @@ def test_a_sample_goes_out_once() -> None:
     assert sensors.due(S + 6 * MS) == ()
 
 
-def test_late_tick_gets_one_reading_per_measurement_oldest_first() -> None:
+def test_late_tick_receives_all_measurements_oldest_first() -> None:
     sensors = make(LinkSensorSettings(latency=1e-3, jitter=0.05))
     for tick in ticks_of(50):
         sensors.measure(tick, ANGLES, RATES)
@@ -314,7 +314,7 @@ def test_jitter_is_half_normal_beyond_the_latency() -> None:
         assert fit.pvalue > 1.0 - CONFIDENCE, f'{name}, seed {SEED}'
 
 
-def test_jitter_lets_samples_of_one_instant_arrive_apart() -> None:
+def test_jitter_separates_samples_of_one_instant() -> None:
     readings = observe(make(LinkSensorSettings(latency=4e-3, jitter=5e-3)), ticks_of(200))
     stamps = [reading.stamp_ns for _, reading in readings]
     assert len(set(stamps)) < len(stamps)
@@ -331,14 +331,14 @@ def test_rate_takes_every_nth_tick(rate: float, every: int) -> None:
 
 @pytest.mark.parametrize('rate', [1.7, 30.0, 100.0, 249.9])
 def test_rate_that_does_not_fit_the_ticks_is_right_on_average(rate: float) -> None:
-    """Sample n comes at the first tick at or after n / rate."""
+    """Sample n is measured at the first tick at or after n / rate."""
     readings = observe(make(LinkSensorSettings(rate=rate)), ticks_of(5000))
     for n, (tick, _) in enumerate(readings):
         assert 0.0 <= (tick - S) * 1e-9 - n / rate + 1e-9 < PERIOD * 1e-9 + 1e-9
     assert len(readings) == pytest.approx(5000 * PERIOD * 1e-9 * rate, abs=1.0)
 
 
-def test_next_sample_is_told() -> None:
+def test_time_of_the_next_sample_is_known() -> None:
     sensors = make(LinkSensorSettings(rate=100.0))
     assert sensors.next_sample_ns is None
     sensors.measure(S, ANGLES, RATES)
@@ -376,8 +376,8 @@ def test_no_dropout_loses_nothing_and_dropout_1_everything() -> None:
     assert observe(make(LinkSensorSettings(dropout=1.0)), ticks_of(COUNT)) == []
 
 
-def test_sensor_that_gave_no_sample_is_left_out() -> None:
-    """Never NaN, never 0, and the angles that are there belong to their names."""
+def test_sensor_without_a_sample_is_missing_in_the_message() -> None:
+    """There is neither NaN nor 0 in its place, and the other angles belong to their names."""
     readings = observe(make(LinkSensorSettings(dropout=0.5, gyro=True)), ticks_of(200))
     truth = dict(zip(LINK_NAMES, zip(ANGLES, RATES)))
     sizes = set()
@@ -408,7 +408,7 @@ def test_fault_of_one_sensor_leaves_the_others_bit_for_bit(kind: str) -> None:
 
 
 @pytest.mark.parametrize('kind', SENSOR_FAULTS)
-def test_mended_sensor_goes_on_as_if_it_had_never_broken(kind: str) -> None:
+def test_sensor_after_a_fault_equals_one_without_a_fault(kind: str) -> None:
     sensors, never = make(NASTY), make(NASTY)
     sensors.set_faults(fault(kind))
     ticks = ticks_of(600)
@@ -426,7 +426,7 @@ def test_mended_sensor_goes_on_as_if_it_had_never_broken(kind: str) -> None:
 
 @pytest.mark.parametrize('changed', [
     {'dropout': 0.2}, {'jitter': 5e-3}, {'gyro': True, 'gyro_noise_rms': 0.1}, {'latency': 0.1}])
-def test_one_setting_leaves_the_noise_of_what_arrives(changed: dict[str, Any]) -> None:
+def test_other_settings_do_not_change_the_noise(changed: dict[str, Any]) -> None:
     plain = LinkSensorSettings(noise_rms=2e-3, random_walk=1e-3)
     reference, samples = run(plain)['link_a'], run(replace(plain, **changed))['link_a']
     arrived = np.isin(reference.stamps, samples.stamps)
@@ -434,13 +434,13 @@ def test_one_setting_leaves_the_noise_of_what_arrives(changed: dict[str, Any]) -
     assert samples.angles.tobytes() == reference.angles[arrived].tobytes()
 
 
-def test_off_gives_nothing() -> None:
+def test_off_gives_no_sample() -> None:
     samples = run(PERFECT, fault('off'))
     assert len(samples['link_b'].stamps) == 0
     assert len(samples['link_a'].stamps) == COUNT
 
 
-def test_samples_on_their_way_still_arrive_when_a_sensor_goes_off() -> None:
+def test_earlier_samples_arrive_after_a_sensor_goes_off() -> None:
     sensors = make(LinkSensorSettings(latency=0.1))
     sensors.measure(S, ANGLES, RATES)
     sensors.set_faults(fault('off'))
@@ -449,7 +449,7 @@ def test_samples_on_their_way_still_arrive_when_a_sensor_goes_off() -> None:
 
 
 def test_stuck_repeats_the_last_sample_given_bit_for_bit() -> None:
-    """With new stamps, and angle and gyro alike."""
+    """Angle and gyro are repeated with new stamps."""
     sensors = make(replace(NASTY, latency=0.0, jitter=0.0))
     ticks = ticks_of(200)
     before = by_sensor(observe(sensors, ticks[:100], patience=0), 'link_b')
@@ -466,7 +466,7 @@ def test_stuck_from_the_start_repeats_the_first_sample() -> None:
     assert set(samples.angles) == {run(LinkSensorSettings(noise_rms=2e-3))['link_b'].angles[0]}
 
 
-def test_garbage_is_any_angle_equally_likely() -> None:
+def test_garbage_is_uniform_over_a_turn() -> None:
     angles = run(PERFECT, fault('garbage'))['link_b'].angles
     assert ((angles > -pi) & (angles <= pi)).all()
     fit = stats.kstest(angles, stats.uniform(-pi, 2.0 * pi).cdf)
@@ -500,7 +500,7 @@ def slow_response(period: int, truth: Callable[[int], Array], time_constant: flo
 
 @pytest.mark.parametrize('period', [MS, 4 * MS, 50 * MS])
 def test_slow_lags_behind_a_ramp_as_a_first_order_system_does(period: int) -> None:
-    """The lag is rate * T * (1 - exp(-t / T)) at whatever rate the sensor samples."""
+    """The lag is rate * T * (1 - exp(-t / T)) at any rate of the sensor."""
     rate, time_constant = 0.8, 0.3
 
     def ramp(stamp_ns: int) -> Array:
@@ -509,7 +509,7 @@ def test_slow_lags_behind_a_ramp_as_a_first_order_system_does(period: int) -> No
     samples = slow_response(period, ramp, time_constant)
     time = (samples.stamps - S) * 1e-9
     lag = rate * time - samples.angles
-    # Some hundred roundings of 1e-16, all to one side.
+    # Bound of the rounding errors: some hundred roundings of 1e-16 of one sign.
     np.testing.assert_allclose(
         lag, rate * time_constant * (1.0 - np.exp(-time / time_constant)), rtol=0.0, atol=1e-12)
 
@@ -528,7 +528,7 @@ def test_slow_forgets_a_jump_with_its_time_constant() -> None:
 
 
 def test_slow_follows_through_the_cut_at_pi() -> None:
-    """A link that turns on and on is followed the short way."""
+    """The angle of a turning link is filtered without a jump."""
     def turning(stamp_ns: int) -> Array:
         return np.full(4, 3.0 * stamp_ns / S)
 
@@ -556,18 +556,18 @@ def test_intermittent_and_dropout_are_independent() -> None:
     assert_rate(len(samples.stamps), COUNT, 0.6 * 0.5)
 
 
-def test_fault_of_a_joint_encoder_hits_that_encoder() -> None:
+def test_fault_of_a_joint_encoder_changes_only_that_encoder() -> None:
     samples = run(LinkSensorSettings(kind='joint'), fault('off', 'joint_3'), count=10)
     assert [name for name in samples if not len(samples[name].stamps)] == ['joint_3']
 
 
-def test_fault_of_the_heading_leaves_the_encoders() -> None:
+def test_fault_of_the_heading_does_not_change_the_encoders() -> None:
     samples = run(LinkSensorSettings(kind='joint', heading='link_c'), fault('off', 'link_c'),
                   count=10)
     assert [name for name in samples if not len(samples[name].stamps)] == ['link_c']
 
 
-def test_reset_loses_what_is_on_its_way_and_time_may_start_anywhere() -> None:
+def test_reset_drops_pending_samples_and_accepts_any_time() -> None:
     sensors = make(LinkSensorSettings(latency=5e-3, rate=100.0))
     sensors.measure(S, ANGLES, RATES)
     sensors.reset()
@@ -576,7 +576,7 @@ def test_reset_loses_what_is_on_its_way_and_time_may_start_anywhere() -> None:
     assert [reading.stamp_ns for reading in sensors.due(S)] == [10 * MS]
 
 
-def test_random_numbers_go_on_after_reset() -> None:
+def test_random_numbers_continue_after_reset() -> None:
     sensors, without = (make(LinkSensorSettings(noise_rms=2e-3)) for _ in range(2))
     for each in (sensors, without):
         each.measure(S, ANGLES, RATES)
@@ -587,7 +587,7 @@ def test_random_numbers_go_on_after_reset() -> None:
     assert sensors.due(2 * S)[0].angles.tobytes() == without.due(2 * S)[0].angles.tobytes()
 
 
-def test_drift_goes_on_after_reset() -> None:
+def test_drift_continues_after_reset() -> None:
     sensors = make(LinkSensorSettings(random_walk=0.1))
     for tick in ticks_of(50):
         sensors.measure(tick, ANGLES, RATES)
@@ -597,7 +597,7 @@ def test_drift_goes_on_after_reset() -> None:
     assert sensors.due(3 * S)[0].angles.tobytes() == last.tobytes()
 
 
-def test_slow_sensor_knows_where_the_linkage_was_put() -> None:
+def test_slow_sensor_starts_at_the_angle_after_a_reset() -> None:
     sensors = make(PERFECT)
     sensors.set_faults(fault('slow 5'))
     sensors.measure(S, ANGLES, RATES)

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A table file is read as it stands, or refused by the name of the wrong key."""
+"""Table files: values, defaults, presets, and refusal with the name of the key."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -28,7 +28,7 @@ each_value = pytest.mark.parametrize(('section', 'key'), PLACES)
 
 @pytest.fixture
 def written(tmp_path: Path) -> Callable[[Any], str]:
-    """Write a table file and return its path."""
+    """Return a function that writes a table file and returns its path."""
     def write(content: Any) -> str:
         path = tmp_path / 'table.yaml'
         path.write_text(yaml.safe_dump(content))
@@ -42,7 +42,7 @@ def with_value(section: str, key: str, value: Any) -> dict[str, Any]:
     return content
 
 
-def test_values_arrive(written: Callable[[Any], str]) -> None:
+def test_values_are_read(written: Callable[[Any], str]) -> None:
     assert load_table(written(GOOD)) == Table(
         LinkSensorSettings(noise_rms=1e-3, counts_per_turn=4096), WheelEncoders(0))
 
@@ -111,7 +111,7 @@ def test_bad_effect_is_refused_by_name_with_its_limit(
         load_table(path)
 
 
-def test_what_is_left_out_does_not_act(written: Callable[[Any], str]) -> None:
+def test_missing_effects_are_zero(written: Callable[[Any], str]) -> None:
     table = load_table(written(GOOD))
     assert table == load_table(written({
         **GOOD, 'wheel_bearings': {}, 'joints': {}, 'links': {}, 'surface': {},

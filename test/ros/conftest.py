@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Nodes in processes of their own on a domain of their own, and a probe that watches them."""
+"""Nodes in their own processes on their own domain, and a probe that watches them."""
 
 from contextlib import contextmanager, suppress
 import fcntl
@@ -30,20 +30,20 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-# Tests are no package: what they share is loaded from its file.
+# Tests are no package: shared code is loaded from its file.
 _spec = spec_from_file_location('fork_server', Path(__file__).with_name('fork_server.py'))
 _fork_server = module_from_spec(_spec)
 _spec.loader.exec_module(_fork_server)
 
+# Longest wait for a condition [s of LoadClock].
 DEADLINE_S = 20.0
-"""Longest wait for a condition [s of LoadClock]."""
+# Command timeout of the devices in tests [s]: longer than other processes delay one here.
 COMMAND_TIMEOUT_S = 1.0
-"""Command timeout of the devices in tests [s]: longer than other processes delay one here."""
+# Time after which the first response of a service counts as lost [s of LoadClock].
 RETRY_INTERVAL_S = 3.0
-"""Time after which the first response of a service counts as lost [s of LoadClock]."""
 DOMAINS = range(1, 102)
+# Domains in which a process was killed: locks in its shared memory may never be released.
 spoiled_domains = set()
-"""Domains in which a process was killed: locks in its shared memory may never be released."""
 
 
 class LoadClock:
@@ -102,10 +102,10 @@ DEEP = QoSProfile(depth=5000)
 COMMAND = QoSProfile(depth=10)
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
-# A node ends in this order, so that none complains about another one's silence.
+# Nodes end in this order, so that no node reports the silence of another one.
 STOP_ORDER = ('controller', 'estimator', 'plant', 'hardware', 'prototype_emulator')
 
-# What a testbed may be, with the processes that it takes, the one with its topics last.
+# Processes of each kind of device; the last one has the topics.
 DEVICES = {'plant': ('plant',), 'hardware': ('prototype_emulator', 'hardware')}
 
 
@@ -160,12 +160,12 @@ def on_a_bus():
 
 class Process:
     """
-    One `fourbar NAME ...` in a process of its own.
+    One `fourbar NAME ...` in its own process.
 
-    :param folder: for what it prints.
-    :param shared_memory: takes note of what it owns.
-    :param fork_server: where to fork it, None for a fresh interpreter.
-    :ivar awaited: whether a test has waited for its end.
+    :param folder: folder of the files with stdout and stderr.
+    :param shared_memory: records the shared-memory files of the process.
+    :param fork_server: forks the process; None starts a fresh interpreter.
+    :ivar awaited: whether a test has waited for the end of the process.
     """
 
     def __init__(self, name, arguments, folder, shared_memory, fork_server):
@@ -186,12 +186,12 @@ class Process:
 
     @property
     def stdout(self):
-        """What it printed so far."""
+        """The text on stdout so far."""
         return self._out.read_text()
 
     @property
     def stderr(self):
-        """What it complained about so far."""
+        """The text on stderr so far."""
         return self._err.read_text()
 
     def send(self, number):
@@ -199,7 +199,7 @@ class Process:
         self.popen.send_signal(number)
 
     def end(self, number=None, seconds=2 * DEADLINE_S):
-        """Wait for the end, after a signal if one is given, and return the exit code."""
+        """Send a signal if one is given, wait for the end, and return the exit code."""
         self.awaited = True
         if self.popen.poll() is None:
             self._shared_memory.note(self.popen.pid)
@@ -210,7 +210,7 @@ class Process:
         return self.popen.returncode
 
     def kill(self):
-        """Kill it."""
+        """Kill the process."""
         self.awaited = True
         self._shared_memory.note(self.popen.pid)
         self._shared_memory.spoiled = True
@@ -218,7 +218,7 @@ class Process:
         self.popen.wait()
 
     def check_clean(self):
-        """Fail unless it ended with exit code 0 and printed no error."""
+        """Fail unless the process ended with exit code 0 and printed no error."""
         assert (self.name, self.popen.returncode) == (self.name, 0), self.stderr
         for word in ('Traceback', 'FATAL', 'Error', 'terminate called'):
             assert word not in self.stdout + self.stderr
@@ -238,10 +238,10 @@ def shared_memory_of(pid):
 
 class SharedMemory:
     """
-    What the middleware keeps in /dev/shm for the processes of a module.
+    Files of the middleware in /dev/shm for the processes of a module.
 
-    :ivar seen: files that they were seen to own.
-    :ivar spoiled: whether a process was killed, whose shared files then stay.
+    :ivar seen: files that the processes owned at some time.
+    :ivar spoiled: whether a process was killed; the files of a killed process stay.
     """
 
     def __init__(self):
@@ -249,12 +249,12 @@ class SharedMemory:
         self.spoiled = False
 
     def note(self, pid):
-        """Remember what a process owns now."""
+        """Record the files that a process owns now."""
         with suppress(OSError):     # it ended by itself
             self.seen |= shared_memory_of(pid)
 
     def left(self):
-        """Return the files that exist although no running process owns them."""
+        """Return the files that no running process owns."""
         left = {path for path in self.seen if path.exists()}
         for folder in Path('/proc').glob('[0-9]*') if left else ():
             with suppress(OSError):     # it ended, or is another user's
@@ -262,7 +262,7 @@ class SharedMemory:
         return left
 
     def check(self):
-        """Fail if anything is left, once all have ended; after a kill remove it instead."""
+        """Fail if files are left after the end of all processes; after a kill remove them."""
         if self.spoiled:
             for path in self.left():
                 path.unlink(missing_ok=True)
@@ -272,11 +272,11 @@ class SharedMemory:
 
 class Suite:
     """
-    Processes of one test or module, all of which end with it.
+    Processes of one test or module, which end with the test or module.
 
-    :param folder: for what they print.
-    :param shared_memory: takes note of what they own.
-    :param fork_server: where to fork those that need no interpreter of their own.
+    :param folder: folder of the files with stdout and stderr.
+    :param shared_memory: records the shared-memory files of the processes.
+    :param fork_server: forks the processes that need no fresh interpreter.
     """
 
     def __init__(self, folder, shared_memory, fork_server):
@@ -289,8 +289,8 @@ class Suite:
         """
         Start `fourbar NAME ARGUMENTS`.
 
-        :param fresh: as a user does, in an interpreter that has imported nothing: for tests of how
-            processes start and end.
+        :param fresh: use a new interpreter, as a user does, for tests of how processes start and
+            end.
         """
         folder = self.folder / f'{len(self._started)}_{name}'
         folder.mkdir()
@@ -300,7 +300,7 @@ class Suite:
         return process
 
     def node(self, name, parameters=None, namespace='', arguments=(), fresh=False):
-        """Start a node with parameters in a namespace; a plant waits long for commands."""
+        """Start a node with parameters in a namespace; a plant has a long command timeout."""
         ros_args = ['--ros-args']
         patience = ({'command_timeout': COMMAND_TIMEOUT_S}
                     if name in ('plant', 'hardware', 'prototype_emulator') else {})
@@ -313,15 +313,15 @@ class Suite:
 
     @staticmethod
     def bus():
-        """Return parameters of the nodes on a bus with which they find each other."""
+        """Return parameters with which the nodes on a bus find each other."""
         return on_a_bus()
 
     def device(self, device, parameters=None, namespace='', emulator=None):
         """
-        Start a testbed of the bench scale, simulated or on a bus, and return its processes.
+        Start a device of the bench scale, simulated or on a bus, and return its processes.
 
         :param parameters: of the node with the topics.
-        :param emulator: parameters of the emulated links, where there are some.
+        :param emulator: parameters of the emulated links, for a device on a bus.
         """
         given = {name: {'mechanism': 'prototype'} for name in DEVICES[device]}
         if device == 'plant':
@@ -335,13 +335,13 @@ class Suite:
         return {name: self.node(name, given[name], namespace) for name in DEVICES[device]}
 
     def nodes(self, namespace='', fresh=False, **parameters):
-        """Start plant, estimator and controller; parameters by the name of the node."""
+        """Start plant, estimator and controller with parameters by the name of the node."""
         return {name: self.node(name, parameters.get(name), namespace, fresh=fresh)
                 for name in ('plant', 'estimator', 'controller')}
 
     def close(self):
         """Stop the nodes that still run and check that all ended cleanly."""
-        # Those that were waited for are their tests' own business.
+        # A test that waited for a process has checked its end.
         unwatched = [process for process in self._started if not process.awaited]
         try:
             for process in sorted(unwatched, key=lambda one: STOP_ORDER.index(one.name)):
@@ -356,7 +356,7 @@ class Suite:
 
 class Probe:
     """
-    A node of the tests: it listens, asks, drives wheels, and waits for conditions.
+    A node of the tests: it subscribes, calls services, sends commands, and waits for conditions.
 
     :ivar received: list of messages by the topic's relative name, see `follow`.
     """
@@ -395,13 +395,13 @@ class Probe:
         return result
 
     def catch_up(self):
-        """Handle everything that has arrived by now."""
+        """Handle every message that has arrived by now."""
         # The executor serves in the order of arrival.
         task = self._executor.create_task(lambda: None)
         self.wait(task.done)
 
     def follow(self, *topics, kind=JointState, qos=DEEP):
-        """Collect what comes on some topics, and return the list of (the last of) them."""
+        """Collect the messages of some topics, and return the list of the last topic."""
         for topic in topics:
             if topic not in self.received:
                 self.received[topic] = []
@@ -413,9 +413,9 @@ class Probe:
 
     def unfollow(self):
         """
-        Follow no longer what comes every tick.
+        End the subscriptions to topics of every tick.
 
-        Two cores that run three nodes have no time to spare for messages that no test reads.
+        Two cores that run three nodes are too slow to receive messages that no test reads.
         """
         for topic, subscription in self._every_tick.items():
             self.node.destroy_subscription(subscription)
@@ -423,7 +423,7 @@ class Probe:
         self._every_tick.clear()
 
     def newest(self, topic):
-        """Follow a topic and return its newest message, after waiting for the first."""
+        """Follow a topic, wait for a message, and return the newest one."""
         messages = self.follow(topic)
         return self.wait(lambda: messages)[-1]
 
@@ -488,7 +488,7 @@ class Probe:
         return future.result()
 
     def arm(self, wanted=True):
-        """Ask the device to arm or disarm."""
+        """Request the device to arm or disarm."""
         return self.call(SetBool, 'arm', SetBool.Request(data=wanted))
 
     def trigger(self, service):
@@ -502,7 +502,7 @@ class Probe:
         return publisher
 
     def drive(self, torques):
-        """Answer every tick with these torques [N m] from now on, None to stop answering."""
+        """Answer every tick with these torques [N m] from now on; None ends the answers."""
         self._torques = torques
         if self._driving is None:
             self._driving = self.publisher(JointState, 'flywheel_command')
@@ -518,16 +518,16 @@ class Probe:
         if self._torques is not None:
             self.command(stamp_of(tick), effort=self._torques)
 
-    def setpoint_verdict(self, message, publisher):
-        """Send a setpoint and return the values of controller_status after the verdict."""
+    def setpoint_decision(self, message, publisher):
+        """Send a setpoint and return the values of controller_status after the decision."""
         before = self.status('controller_status')
         publisher.publish(message)
         received = self.received['controller_status']
 
-        def judged():
+        def decided():
             now = values_of(received[-1])
             return now if any(now[key] != before[key] for key in ('accepted', 'refused')) else None
-        return self.wait(judged)
+        return self.wait(decided)
 
 
 @pytest.fixture(scope='session')
@@ -544,7 +544,7 @@ def compiled():
 
 @pytest.fixture(scope='session')
 def fork_server(compiled):
-    """Fork processes that need no interpreter of their own."""
+    """Fork processes that need no fresh interpreter."""
     fork_server = _fork_server.ForkServer()
     yield fork_server
     fork_server.close()
@@ -552,7 +552,7 @@ def fork_server(compiled):
 
 @pytest.fixture(scope='module')
 def domain(compiled):
-    """Give the module a domain of its own, and its processes the environment for it."""
+    """Claim a domain for the module, and set it in the environment of the processes."""
     with claimed_domain() as number, pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_DOMAIN_ID', str(number))
         patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
@@ -563,7 +563,7 @@ def domain(compiled):
 
 @pytest.fixture(scope='module')
 def shared_memory(domain):
-    """Check, when everything has ended, that it left nothing in /dev/shm."""
+    """Check after the end of all processes that they left no file in /dev/shm."""
     shared_memory = SharedMemory()
     yield shared_memory
     if shared_memory.spoiled:
@@ -589,9 +589,9 @@ def suite(shared_memory, fork_server, tmp_path):
 
 @pytest.fixture(scope='module')
 def make_probe(domain, shared_memory):
-    """Return a function that makes a probe, closed at the end of the module; it has all probes."""
+    """Return a function that makes a probe; its attribute `probes` lists those of the module."""
     probes = []
-    # A full search for garbage in all that pytest has imported outlasts a command timeout.
+    # A full garbage collection of all modules that pytest imports outlasts a command timeout.
     gc.collect()
     gc.freeze()
 
@@ -607,5 +607,5 @@ def make_probe(domain, shared_memory):
 
 @pytest.fixture(scope='module')
 def probe(make_probe):
-    """Watch the module's nodes."""
+    """Watch the nodes of the module."""
     return make_probe()

@@ -24,7 +24,7 @@ PR_SET_PDEATHSIG = 1
 
 
 class ForkServer:
-    """The parent of forked processes; it starts with the first request and ends with `close`."""
+    """The parent of forked processes; the first request starts it and `close` ends it."""
 
     def __init__(self):
         self._process = None
@@ -50,7 +50,7 @@ class ForkServer:
             environment=environment))
 
     def close(self):
-        """End the parent; children see to themselves."""
+        """End the parent; the children end by themselves."""
         if self._process is None:
             return
         self._process.stdin.close()
@@ -60,9 +60,9 @@ class ForkServer:
 
 class Forked:
     """
-    What subprocess.Popen is to a process of its own.
+    A forked process with the interface of subprocess.Popen.
 
-    :ivar returncode: as that of Popen, None while nobody has noticed the end.
+    :ivar returncode: exit code as of Popen, None until `poll` has found the end of the process.
     """
 
     def __init__(self, fork_server, pid):
@@ -87,23 +87,23 @@ class Forked:
 
     def send_signal(self, number):
         """Send a signal unless it has ended."""
-        # Until it is polled after its end it keeps its number.
+        # A process keeps its number until it is polled after its end.
         if self.poll() is None:
             os.kill(self.pid, number)
 
     def kill(self):
-        """Kill it."""
+        """Kill the process."""
         self.send_signal(signal.SIGKILL)
 
 
 def _serve():
-    """Fork whenever asked to, and return in the child, with its arguments."""
+    """Fork at every request, and return in the child, with its arguments."""
     from fourbar_ros.cli import main  # noqa: F401
     from fourbar_ros.loop.warm_up import warm_up
     from fourbar_ros.operator import recorder  # noqa: F401
     from fourbar_ros.ros import controller, estimator, plant  # noqa: F401
     warm_up()
-    # Else every child would copy all that, in order to search it for garbage at its end.
+    # Without this every child would copy these objects at its end for the garbage collection.
     gc.collect()
     gc.freeze()
     for line in sys.stdin:

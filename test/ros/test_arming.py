@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Who may drive the wheels, what stops them, and what the wheels do then."""
+"""Arming, emergency stop, command timeout: conditions, and their effect on the wheels."""
 
 import signal
 
@@ -13,11 +13,11 @@ from std_msgs.msg import Bool
 pytestmark = pytest.mark.node
 
 PERIOD_S = 0.004
-# As the harness starts plants.
-# Others forget a node that died after 20 s.
+# Time limit for the discovery to drop a dead node, which takes 20 s on a quiet machine [s].
 FORGOTTEN_S = 60.0
+# Command timeout with which the suite starts plants [s].
 COMMAND_TIMEOUT_S = 1.0
-# Ticks that a command may be under way on a busy machine.
+# Largest delay of a command on a busy machine [s].
 A_FEW_TICKS_S = 25 * PERIOD_S
 
 SPIN_UP = [6e-5, 2e-5, -4e-5, 5e-5]
@@ -29,7 +29,7 @@ def stamp_of(message):
 
 @pytest.fixture(scope='module')
 def testbed(module_suite, probe):
-    """Run a plant on its own, driven by the probe."""
+    """Run a plant alone, driven by the probe."""
     module_suite.node('plant')
     probe.drive([0.0] * 4)
     probe.follow('flywheel_states', 'sim/flywheel_states', 'sim/link_states')
@@ -39,7 +39,7 @@ def testbed(module_suite, probe):
 
 @pytest.fixture(autouse=True)
 def released(request):
-    """Leave the plant as it was found: driven by one, disarmed."""
+    """Leave the plant disarmed, with one publisher of commands."""
     yield
     if 'testbed' in request.fixturenames:
         testbed = request.getfixturevalue('testbed')
@@ -50,7 +50,7 @@ def released(request):
 
 
 def speeds_after(testbed, count):
-    """Return (n, 4) absolute wheel speeds and (n, 4) efforts of n more ticks."""
+    """Return absolute wheel speeds (n, 4) and efforts (n, 4) of n more ticks."""
     testbed.catch_up()
     testbed.more('sim/flywheel_states', count)
     wheels = {stamp_of(message): message for message in
@@ -65,12 +65,12 @@ def speeds_after(testbed, count):
 
 
 def spinning(testbed, minimum=10.0):
-    """Tell whether every wheel turns."""
+    """Return whether every wheel turns."""
     return min(np.abs(testbed.received['sim/flywheel_states'][-1].velocity)) > minimum
 
 
 def spin_up(testbed):
-    """Drive until every wheel turns; arm again if this process was held up for too long."""
+    """Drive until every wheel turns; arm again after a command timeout."""
     testbed.drive(SPIN_UP)
 
     def turning():
@@ -82,7 +82,7 @@ def spin_up(testbed):
 
 
 def refusal(testbed):
-    """Ask for arming until it is refused, and return the reason."""
+    """Request arming until it is refused, and return the reason."""
     def refused():
         response = testbed.arm()
         if response.success:
@@ -93,12 +93,12 @@ def refusal(testbed):
 
 
 def arm_when_possible(testbed):
-    """Ask for arming until it is granted."""
+    """Request arming until it is granted."""
     testbed.wait(lambda: testbed.arm().success)
 
 
 def assert_coasting(testbed):
-    """Without torque nothing outside turns a wheel, whatever its link does."""
+    """Check that the wheels have no torque and constant absolute speeds."""
     speeds, efforts = speeds_after(testbed, 100)
     assert not efforts.any()
     assert np.ptp(speeds, axis=0) == pytest.approx(0.0, abs=1e-9)
@@ -128,7 +128,7 @@ def test_status_goes_to_diagnostics_at_once(testbed):
     assert {item.key: item.value for item in status.values}['state'] == 'armed'
     arrays = testbed.received['/diagnostics']
     stamps = [array.header.stamp.sec + array.header.stamp.nanosec * 1e-9 for array in arrays]
-    # Between two of the regular ones, which are a second apart.
+    # The regular messages are a second apart; the message of the change is between two of them.
     testbed.diagnostics('plant')
     assert min(np.diff(stamps)) < 0.95
 
@@ -162,7 +162,7 @@ def test_reset_without_a_stop_changes_nothing(testbed):
     assert testbed.status('device_status')['state'] == 'armed'
 
 
-def test_request_to_stop_is_obeyed_and_false_is_no_request(testbed):
+def test_request_true_on_the_stop_topic_stops_and_false_has_no_effect(testbed):
     request = testbed.publisher(Bool, 'emergency_stop_request')
     testbed.arm()
     testbed.drive(SPIN_UP)
@@ -193,7 +193,7 @@ def test_a_second_publisher_of_angles_prevents_arming(testbed):
     arm_when_possible(testbed)
 
 
-def test_all_obstacles_are_named(testbed):
+def test_refusal_names_all_arming_blockers(testbed):
     rivals = [testbed.node.create_publisher(JointState, topic, 10)
               for topic in ('flywheel_command', 'link_angles')]
     testbed.wait(lambda: 'flywheel_command' in (reason := refusal(testbed))
@@ -203,7 +203,7 @@ def test_all_obstacles_are_named(testbed):
     arm_when_possible(testbed)
 
 
-def test_wheels_coast_when_commands_stay_away(testbed):
+def test_wheels_coast_after_the_command_timeout(testbed):
     testbed.arm()
     spin_up(testbed)
 
@@ -214,7 +214,7 @@ def test_wheels_coast_when_commands_stay_away(testbed):
     assert_coasting(testbed)
 
 
-def test_plant_that_nobody_commands_disarms(testbed):
+def test_plant_without_commands_disarms_after_the_timeout(testbed):
     testbed.drive(None)
     testbed.more('sim/flywheel_states', 50)
     testbed.arm()
@@ -246,8 +246,8 @@ def test_timeout_action(suite, make_probe, action):
         message for message in testbed.received['sim/flywheel_states']
         if stamp_of(message) >= lost_ns - 1000), None))
     wanted = np.zeros(4) if action == 'brake' else np.array(first.velocity)
-    # The loop knows speeds as means over a period (half a period late while they rise) and to
-    # one encoder count per period, when it begins and afterwards.
+    # The speed loop measures means over a period, which lag by half a period while speeds rise,
+    # with an error of one encoder count per period, at its begin and afterwards.
     tolerance = max(SPIN_UP) / 3.4e-7 * PERIOD_S / 2 + 2 * (2 * np.pi / 16384 / PERIOD_S)
     testbed.wait(lambda: np.abs(
         testbed.received['sim/flywheel_states'][-1].velocity - wanted).max() < tolerance)
@@ -257,7 +257,7 @@ def test_timeout_action(suite, make_probe, action):
 
 @pytest.fixture
 def moving(suite, make_probe):
-    """Three nodes in the middle of a move."""
+    """Return three nodes in the middle of a move, and a probe."""
     nodes = suite.nodes('/moving', controller={'setpoint_duration': 6.0})
     watcher = make_probe('/moving')
     watcher.follow('flywheel_states', 'sim/flywheel_states', 'sim/link_states',
@@ -265,10 +265,10 @@ def moving(suite, make_probe):
     watcher.newest('flywheel_command')
     arm_when_possible(watcher)
     watcher.status('controller_status', mode='hold')
-    verdict = watcher.setpoint_verdict(
+    decision = watcher.setpoint_decision(
         JointState(name=['link_a', 'link_b'], position=[0.6, 1.7]),
         watcher.publisher(JointState, 'setpoint'))
-    assert verdict['accepted'] == '1', verdict['last_refusal']
+    assert decision['accepted'] == '1', decision['last_refusal']
     watcher.wait(lambda: spinning(watcher, 5.0))
     return nodes, watcher
 
@@ -290,13 +290,13 @@ def test_lost_controller_leaves_the_wheels_coasting(moving, make_probe, number):
                     if any(message.effort))
     assert (driven_ns - silent_ns) * 1e-9 < COMMAND_TIMEOUT_S + A_FEW_TICKS_S
     if number == signal.SIGKILL:
-        # Once the others forget the dead one: to destroy a publisher at that very moment, as the
-        # end of the module does, locks Fast DDS up for ever.
+        # Wait until the discovery has dropped the dead node: Fast DDS deadlocks when a publisher
+        # is destroyed at that moment, as at the end of the module.
         topic = watcher.node.resolve_topic_name('flywheel_command')
         for each in make_probe.probes:
             watcher.wait(lambda node=each.node: node.count_publishers(topic) == 0, FORGOTTEN_S)
         return
-    # It comes back and finds the device disarmed: no goal, no torque.
+    # The controller continues and finds the device disarmed: no goal, no torque.
     controller.send(signal.SIGCONT)
     assert watcher.status('controller_status', mode='disarmed')['goal'] == ''
     assert_coasting(watcher)

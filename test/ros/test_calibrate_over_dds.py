@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""`fourbar calibrate` over real DDS: it finds what the plant has, and leaves no wheel driven."""
+"""`fourbar calibrate` over DDS estimates the parameters of the plant and ends without torque."""
 
 import json
 import signal
@@ -20,7 +20,7 @@ WHEELS = ('wheels', '--wheels', 'flywheel_b', '--speed', '45', '--coast', '2.5',
 
 @pytest.fixture(scope='module')
 def plant(module_suite, probe):
-    """Run the bench-scale linkage on the table of a laboratory; no controller."""
+    """Run the bench-scale linkage on the table of a laboratory, without a controller."""
     module_suite.node('plant', {
         'mechanism': 'prototype', 'table': 'prototype', 'command_timeout': 0.1})
     probe.newest('flywheel_states')
@@ -41,13 +41,13 @@ def start(plant, module_suite):
 
 
 def wait_for_torque(plant):
-    """Wait until a wheel is driven."""
+    """Wait until a wheel has torque."""
     commands = plant.received['flywheel_command']
     plant.wait(lambda: any(any(command.effort) for command in commands))
 
 
 def check_left_without_torque(plant):
-    """Fail unless the device is disarmed, and the wheels got zero torque before that."""
+    """Check that the device is disarmed, and that commands before that were zero."""
     plant.catch_up()
     assert plant.state() == 'disarmed'
     commands = plant.received['flywheel_command']
@@ -55,8 +55,8 @@ def check_left_without_torque(plant):
     assert list(commands[-1].effort) == [0.0] * 4
 
 
-def test_zeros_of_the_encoders(start, tmp_path):
-    """The plant's sensors have none: 500 samples of 0.1 deg, five standard errors."""
+def test_encoder_offsets_of_a_plant_without_offsets_are_zero(start, tmp_path):
+    """The tolerance is five standard errors of 450 samples with 0.1 deg of noise."""
     made, numbers = tmp_path / 'mechanism.yaml', tmp_path / 'zeros.json'
     process = start('encoders', '--pose', 'link_a=0', 'link_b=60deg', '--duration', '2',
                     '-o', str(made), '--json', str(numbers))
@@ -69,12 +69,13 @@ def test_zeros_of_the_encoders(start, tmp_path):
     assert all(check['passed'] for check in found['checks'])
 
 
-def test_one_wheel(start, plant, tmp_path):
+def test_inertia_and_friction_of_one_wheel_are_found(start, plant, tmp_path):
     """
-    To 1 %; and the recording, evaluated again, says the same.
+    The inertia and the friction agree to 1 %; the recording gives the same estimate again.
 
-    So short a coast-down tells the friction at its speeds. How that divides is known to half a
-    percent of Coulomb friction only, so of these alone four standard errors are borne.
+    The short coast-down determines the total friction at its speeds. It separates Coulomb from
+    viscous friction only to half a percent of the former, so each of them alone may deviate by
+    four standard errors.
     """
     made, numbers, again, bag, report = (tmp_path / name for name in (
         'mechanism.yaml', 'wheels.json', 'again.json', 'bag', 'report.yaml'))
@@ -99,7 +100,7 @@ def test_one_wheel(start, plant, tmp_path):
     assert json.loads(again.read_text())['quantities'] == found['quantities']
 
 
-def test_device_that_is_disarmed_meanwhile_ends_it(start, plant):
+def test_command_ends_when_the_device_is_disarmed(start, plant):
     process = start(*WHEELS)
     wait_for_torque(plant)
     plant.arm(False)
@@ -117,11 +118,11 @@ def test_interrupt_leaves_the_wheels_without_torque(start, plant):
     check_left_without_torque(plant)
 
 
-def test_linkage_that_comes_near_a_change_point_ends_it_and_leaves_no_recording(
+def test_command_ends_without_a_recording_near_a_change_point(
         start, plant, tmp_path):
     bag, parameter = tmp_path / 'bag', Parameter(name='initial.link_b')
     parameter.value.type = ParameterType.PARAMETER_DOUBLE
-    # Where this reset takes it, and those of other tests.
+    # The first angle is for this reset, the second for the resets of other tests.
     for angle in (0.24, float(np.pi / 3.0)):
         parameter.value.double_value = angle
         result, = plant.call(SetParameters, 'plant/set_parameters',
@@ -136,7 +137,7 @@ def test_linkage_that_comes_near_a_change_point_ends_it_and_leaves_no_recording(
     check_left_without_torque(plant)
 
 
-def test_nobody_else_may_drive(start, plant):
+def test_second_publisher_of_commands_is_refused(start, plant):
     plant.drive([0.0] * 4)
     process = start(*WHEELS)
     assert process.end() == 2
@@ -145,7 +146,7 @@ def test_nobody_else_may_drive(start, plant):
     assert plant.state() == 'disarmed'
 
 
-def test_without_a_device_it_says_so(start):
+def test_missing_device_is_reported(start):
     process = start('encoders', '--pose', 'link_a=0', 'link_b=1', '--ros-args', '-r',
                     '__ns:=/elsewhere')
     assert process.end() == 2

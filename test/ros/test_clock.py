@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Simulated time over topics: lock-step with real nodes, the guard, and the fast clock."""
+"""Simulated time over topics: lock-step with three nodes, its guard, and the fast clock."""
 
 import os
 import signal
@@ -26,7 +26,7 @@ def stamps(messages):
 
 
 def distinct(messages):
-    """Return the stamps; a tick without an answer comes again, as it was, and so do answers."""
+    """Return the stamps without repetitions: unanswered ticks and their answers are repeated."""
     return list(dict.fromkeys(stamps(messages)))
 
 
@@ -38,9 +38,9 @@ def pause(testbed, wanted=True):
 
 def assert_no_tick_is_missing(testbed, plant):
     """
-    Pause, and compare how many ticks the plant made with the stamp of the last one.
+    Pause, and compare the number of ticks of the plant with the stamp of the last one.
 
-    A probe that was held up may have missed some in between: publishers keep the last ten.
+    The stamps alone do not suffice: publishers keep ten messages, and a delayed probe misses some.
     """
     pause(testbed)
     count, = [int(item.value) for item in testbed.diagnostics(plant).values if item.key == 'ticks']
@@ -70,7 +70,7 @@ def nodes(make_probe, suite, request):
 @pytest.mark.parametrize('order', [('plant', 'estimator', 'controller'),
                                    ('controller', 'estimator', 'plant')], ids=lambda o: o[0])
 def test_every_tick_is_answered_before_the_next(nodes, order):
-    """Not one tick is missing from the first on, whoever starts first."""
+    """No tick is missing from the first one on, in any order of start."""
     namespace, testbed, _ = nodes(*order)
     testbed.follow('estimate/link_states')
     testbed.wait(lambda: len(testbed.received['flywheel_command']) >= 1000)
@@ -83,7 +83,7 @@ def test_every_tick_is_answered_before_the_next(nodes, order):
         assert stamps(answers) == sorted(stamps(answers))
 
 
-def test_guard_tells_who_stands_still_and_time_waits(nodes):
+def test_guard_names_the_stopped_node_and_time_waits(nodes):
     _, testbed, processes = nodes('plant', 'estimator', 'controller')
     testbed.wait(lambda: len(testbed.received['flywheel_command']) >= 100)
     assert testbed.arm().success
@@ -96,7 +96,7 @@ def test_guard_tells_who_stands_still_and_time_waits(nodes):
             testbed.catch_up()
             last = stamps(testbed.received['flywheel_states'])[-1]
             testbed.diagnostics(plant)
-            # Neither the guard nor a watchdog goes on: the plant stays armed, and waits.
+            # Simulated time stops, so no command timeout passes: the plant stays armed and waits.
             assert stamps(testbed.received['flywheel_states'])[-1] == last
             assert testbed.state() == 'armed' or testbed.status('device_status', state='armed')
         finally:
@@ -108,7 +108,7 @@ def test_guard_tells_who_stands_still_and_time_waits(nodes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize('name', ['controller', 'estimator'])
-def test_loop_goes_on_disarmed_when_a_node_was_restarted(nodes, suite, name):
+def test_loop_continues_disarmed_after_the_restart_of_a_node(nodes, suite, name):
     namespace, testbed, processes = nodes('plant', 'estimator', 'controller')
     testbed.wait(lambda: len(testbed.received['flywheel_command']) >= 100)
     assert testbed.arm().success
@@ -130,8 +130,8 @@ def test_missing_controller_is_reported_and_no_tick_is_lost(nodes):
     assert testbed.received['flywheel_states'] == []
 
 
-def test_rejected_answer_is_an_answer_and_the_watchdog_counts_simulated_time(nodes):
-    """Bad commands stop an armed lock-step after command_timeout, they do not freeze it."""
+def test_rejected_answers_advance_time_until_the_command_timeout(nodes):
+    """Rejected commands disarm the plant after `command_timeout` of simulated time."""
     _, testbed, _ = nodes('plant', command_timeout=0.1)
     testbed.drive([0.0] * 4)
     testbed.wait(lambda: len(testbed.received['flywheel_states']) >= 50)
@@ -151,16 +151,16 @@ def test_rejected_answer_is_an_answer_and_the_watchdog_counts_simulated_time(nod
 
 
 @pytest.mark.parametrize('clock', ['fast', 'lockstep'])
-def test_clock_topic_rises_slowly_enough_and_stamps_follow_it(nodes, clock):
-    """At most 200 times a second, also for who comes late, and never back."""
+def test_clock_topic_is_monotonic_with_a_limited_rate(nodes, clock):
+    """A late subscriber receives at most 200 messages per second, and time never decreases."""
     namespace, testbed, _ = nodes('plant', clock=clock, real_time_factor=20.0)
     testbed.drive([0.0] * 4)
     testbed.wait(lambda: len(testbed.received['flywheel_states']) >= 500)
     times = testbed.follow('/clock', kind=Clock)
 
-    def told():
+    def clock_ns():
         return [now.clock.sec * 1_000_000_000 + now.clock.nanosec for now in times]
-    # To be discovered may take longer than what follows, and what waits by then does not count.
+    # Discovery may take longer than the measurement; messages queued until then do not count.
     testbed.wait(lambda: times)
     testbed.catch_up()
     begin, before = time.monotonic(), len(times)
@@ -168,21 +168,21 @@ def test_clock_topic_rises_slowly_enough_and_stamps_follow_it(nodes, clock):
     pause(testbed)
     testbed.catch_up()
     last_ns = stamps(testbed.received['flywheel_states'])[-1]
-    # A tick that is due but not made is where time stands.
-    testbed.wait(lambda: 0 <= told()[-1] - last_ns <= PERIOD_NS)
+    # A paused clock shows the last tick or the next one, which is due.
+    testbed.wait(lambda: 0 <= clock_ns()[-1] - last_ns <= PERIOD_NS)
     count, elapsed = len(times) - before, time.monotonic() - begin
-    assert told() == sorted(told())
-    assert FIRST_NS < told()[0]
-    # Twenty times a second at least; what waited while we looked elsewhere came at once.
+    assert clock_ns() == sorted(clock_ns())
+    assert FIRST_NS < clock_ns()[0]
+    # At least ten messages a second; queued messages may arrive together.
     assert 10 * elapsed < count < 200 * elapsed + 20
     arrays = testbed.follow('/diagnostics', kind=DiagnosticArray)
     testbed.diagnostics(f'{namespace[1:]}/plant')
-    # Simulated time, not that of the system.
+    # The stamp is simulated time, not system time.
     assert arrays[-1].header.stamp.sec < 10 ** 6
 
 
-def test_fast_clock_passes_faster_than_real_time_and_leaves_out_no_tick(nodes):
-    """The ratio is tested by test_clock_modes; here a busy machine may lag, and catch up."""
+def test_fast_clock_is_faster_than_real_time_and_skips_no_tick(nodes):
+    """The module test_clock_modes tests the ratio; here a busy machine may lag and catch up."""
     namespace, testbed, _ = nodes('plant', clock='fast', real_time_factor=2.0)
     testbed.wait(lambda: len(testbed.received['flywheel_states']) >= 10)
     begin = testbed.node.get_clock().now().nanoseconds
@@ -199,7 +199,7 @@ def test_real_time_has_no_clock_topic(nodes):
     assert testbed.node.count_publishers('/clock') == 0
 
 
-def test_sensor_data_is_taken_reliably_where_time_waits_for_it(nodes, suite):
+def test_estimator_subscribes_reliably_under_simulated_time(nodes, suite):
     namespace, testbed, _ = nodes('estimator')
     suite.node('controller', {}, namespace)
 
@@ -207,6 +207,6 @@ def test_sensor_data_is_taken_reliably_where_time_waits_for_it(nodes, suite):
         return sorted((info.node_name, info.qos_profile.reliability.name)
                       for info in testbed.node.get_subscriptions_info_by_topic(
                           f'{namespace}/flywheel_states') if info.node_name != 'probe')
-    # The name of a node comes after its subscriptions.
+    # Discovery reports the name of a node after its subscriptions.
     testbed.wait(lambda: {name for name, _ in found()} == {'estimator', 'controller'})
     assert found() == [('controller', 'BEST_EFFORT'), ('estimator', 'RELIABLE')]

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Plant, estimator and controller as processes close the loop: the laws hold on the topics."""
+"""Closed loop of plant, estimator and controller as processes: conservation laws and errors."""
 
 from fourbar_ros.mechanism import load_mechanism
 import numpy as np
@@ -23,7 +23,7 @@ def by_stamp(messages):
 
 @pytest.fixture(scope='module')
 def run(module_suite, probe):
-    """Arm, move, settle; return all messages by topic and stamp."""
+    """Arm, move and settle; return all messages by topic and stamp."""
     module_suite.nodes(fresh=True, controller={'setpoint_duration': DURATION_S})
     topics = ('sim/link_states', 'sim/flywheel_states', 'estimate/link_states', 'estimate/sigma',
               'estimate/innovation', 'reference', 'tracking_error', 'energy')
@@ -31,10 +31,10 @@ def run(module_suite, probe):
     probe.newest('reference')
     probe.wait(lambda: probe.arm().success)
     probe.status('controller_status', mode='hold')
-    verdict = probe.setpoint_verdict(
+    decision = probe.setpoint_decision(
         JointState(name=['link_a', 'link_b'], position=GOAL),
         probe.publisher(JointState, 'setpoint'))
-    assert verdict['mode'] == 'track'
+    assert decision['mode'] == 'track'
     probe.status('controller_status', mode='hold')
     probe.more('reference', round(SETTLE_S * 250))
     assert probe.status('device_status')['state'] == 'armed'
@@ -43,7 +43,7 @@ def run(module_suite, probe):
 
 
 def paired(run, *topics):
-    """Return the messages of some topics at the stamps that they share, in order of time."""
+    """Return the messages of some topics at their common stamps, in order of time."""
     stamps = sorted(set.intersection(*(set(run[topic]) for topic in topics)))
     assert len(stamps) > 500
     return [[run[topic][stamp] for stamp in stamps] for topic in topics]
@@ -52,19 +52,19 @@ def paired(run, *topics):
 def test_goal_is_reached(run):
     final = run['sim/link_states'][max(run['sim/link_states'])]
     assert np.abs(np.array(final.position)[:2] - GOAL).max() < np.radians(0.5)
-    # The paper's linkage is a parallelogram, and stays one.
+    # The linkage of the paper is a parallelogram on this branch.
     assert final.position[2:] == pytest.approx(final.position[:2], abs=1e-6)
 
 
 def test_angular_momentum_of_links_and_wheels_is_conserved(run):
-    """About the common mass centre, worked out here from positions and velocities."""
+    """The test computes the momentum about the common mass centre from angles and rates."""
     mechanism = load_mechanism('paper')
     masses, lengths = mechanism.link_masses, mechanism.link_lengths
     total, largest = [], 0.0
     for links, wheels in zip(*paired(run, 'sim/link_states', 'sim/flywheel_states')):
         angles, rates = np.array(links.position), np.array(links.velocity)
         along = np.exp(1j * angles)
-        # From joint 1: a and b hang on it, c on the far end of b, d on the far end of a.
+        # Joint 1 is the origin: links a and b begin there, c at the end of b, d at the end of a.
         near = np.array([0.0, 0.0, lengths[1] * along[1], lengths[0] * along[0]])
         near_speed = 1j * np.array([0.0, 0.0, lengths[1] * along[1] * rates[1],
                                     lengths[0] * along[0] * rates[0]])
@@ -80,15 +80,15 @@ def test_angular_momentum_of_links_and_wheels_is_conserved(run):
     assert np.ptp(total) < 1e-9 * largest
 
 
-def test_estimate_is_true(run):
+def test_estimate_agrees_with_the_truth(run):
     estimates, truths = paired(run, 'estimate/link_states', 'sim/link_states')
     errors = np.array([np.array(estimate.position) - truth.position
                        for estimate, truth in zip(estimates, truths)])
     assert np.sqrt(np.mean(errors ** 2)) < np.radians(0.1)
 
 
-def test_estimate_knows_how_good_it_is(run):
-    """Errors scatter as sigma says, within a factor: not a tight test of a short run."""
+def test_estimate_errors_agree_with_sigma(run):
+    """The run is short, so the bounds on errors and NIS are wide."""
     estimates, sigmas, truths = paired(
         run, 'estimate/link_states', 'estimate/sigma', 'sim/link_states')
     normalised = np.array([
@@ -97,7 +97,7 @@ def test_estimate_knows_how_good_it_is(run):
     assert 0.2 < np.sqrt(np.mean(normalised ** 2)) < 3.0
     nis = [message.position[0] / message.position[1]
            for message in run['estimate/innovation'].values()]
-    # Mean of n chi-square variables of four degrees of freedom over four: 1 +- sqrt(1 / 2n).
+    # The mean of n chi-square variables with 4 degrees of freedom, over 4, is 1 +- sqrt(1 / 2n).
     assert np.mean(nis) == pytest.approx(1.0, abs=5.0 * np.sqrt(0.5 / len(nis)) + 0.1)
 
 
@@ -109,7 +109,7 @@ def test_tracking_error_is_reference_minus_estimate(run):
             assert getattr(error, field) == pytest.approx(difference, abs=1e-15)
 
 
-def test_links_follow_the_reference_all_the_way(run):
+def test_links_follow_the_reference_during_the_move(run):
     references, truths = paired(run, 'reference', 'sim/link_states')
     errors = np.array([np.array(reference.position) - truth.position
                        for reference, truth in zip(references, truths)])
@@ -118,14 +118,14 @@ def test_links_follow_the_reference_all_the_way(run):
 
 
 def test_energy_is_that_of_the_wheels(run):
-    """Equation 7 from the true wheel speeds, within what the encoders blur."""
+    """The published energy is eq. 7 with the true wheel speeds, within the encoder resolution."""
     inertia = load_mechanism('paper').flywheel_inertias
     energies, wheels, links = paired(run, 'energy', 'sim/flywheel_states', 'sim/link_states')
     expected = np.array([0.5 * inertia @ (np.array(wheel.velocity) + link.velocity) ** 2
                          for wheel, link in zip(wheels, links)])
-    told = np.array([message.position[0] for message in energies])
+    published = np.array([message.position[0] for message in energies])
     assert expected.max() > 1e-5
-    assert told == pytest.approx(expected, abs=0.05 * expected.max())
-    # The two sums since arming never fall.
+    assert published == pytest.approx(expected, abs=0.05 * expected.max())
+    # The two sums since arming are monotonic.
     armed = np.array([message.position[1:] for message in energies])
     assert (np.diff(armed[armed[:, 1] > 0.0], axis=0) >= 0.0).all()

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What becomes of commands beyond what the suite for all devices looks at."""
+"""Rejection of commands by the plant, beyond the tests for all devices."""
 
 import pytest
 from sensor_msgs.msg import JointState
@@ -32,7 +32,7 @@ def driven(plant, probe):
 def testbed(driven):
     """Arm the plant and hold it with commands of zero torque."""
     driven.drive([0.0] * 4)
-    # Disarming and arming may both fit in one tick, which still tells the torques before.
+    # Disarming and arming may fit in one tick, which still shows the torques before.
     driven.wait(lambda: driven.arm().success and not any(efforts(driven)))
     yield driven
     driven.drive([0.0] * 4)
@@ -45,7 +45,7 @@ def newest_stamp(testbed):
 
 
 def efforts(testbed):
-    """Return the torques really applied at the newest tick."""
+    """Return the true torques at the newest tick."""
     return list(testbed.received['sim/flywheel_states'][-1].effort)
 
 
@@ -54,12 +54,12 @@ def rejected(testbed, fresh=False):
 
 
 def assert_rejected(testbed, kind, count, before, begin):
-    """Check that so many more of one kind were counted, and that no wheel felt any."""
+    """Check that `count` more of one kind are counted, and that no wheel has torque."""
     def counted():
         now = rejected(testbed, fresh=True)
         return now if now.get(kind, 0) - before.get(kind, 0) >= count else None
     now = testbed.wait(counted)
-    # On a busy machine the probe itself may answer a few ticks too late.
+    # On a busy machine the probe itself may answer a few ticks late, so stale ones do not count.
     for counts in (before, now):
         counts.pop('stale', None)
     assert now == before if kind == 'stale' else now == {
@@ -68,7 +68,7 @@ def assert_rejected(testbed, kind, count, before, begin):
                    for message in testbed.received['sim/flywheel_states'][begin:])
 
 
-def assert_next_good_one_works(testbed):
+def assert_next_good_command_acts(testbed):
     testbed.drive(GOOD)
     testbed.wait(lambda: testbed.arm().success and efforts(testbed) == pytest.approx(GOOD))
 
@@ -78,16 +78,16 @@ def test_command_without_a_stamp_is_stale(testbed):
     begin = len(testbed.received['sim/flywheel_states'])
     testbed.command(0, effort=GOOD)
     assert_rejected(testbed, 'stale', 1, before, begin)
-    assert_next_good_one_works(testbed)
+    assert_next_good_command_acts(testbed)
 
 
-def test_command_that_was_overtaken_by_a_newer_one_is_stale(testbed):
+def test_command_older_than_the_last_one_is_stale(testbed):
     before = rejected(testbed)
     begin = len(testbed.received['sim/flywheel_states'])
-    # Fifteen periods: older than the one in force, but not too old by itself.
+    # An age of fifteen periods is below the age limit, but the last command is newer.
     testbed.command(newest_stamp(testbed) - 60_000_000, effort=GOOD)
     assert_rejected(testbed, 'stale', 1, before, begin)
-    assert_next_good_one_works(testbed)
+    assert_next_good_command_acts(testbed)
 
 
 def test_rejections_are_a_warning_with_the_last_reason(testbed, plant):
@@ -101,7 +101,7 @@ def test_rejections_are_a_warning_with_the_last_reason(testbed, plant):
     testbed.wait(lambda: 'flywheel_command rejected' in plant.stdout + plant.stderr)
 
 
-def test_good_command_while_disarmed_is_neither_rejected_nor_obeyed(driven):
+def test_good_command_while_disarmed_is_not_rejected_and_has_no_effect(driven):
     before = rejected(driven)
     driven.arm(False)
     driven.drive(GOOD)
@@ -114,8 +114,8 @@ def test_good_command_while_disarmed_is_neither_rejected_nor_obeyed(driven):
     driven.drive([0.0] * 4)
 
 
-def test_message_from_a_default_publisher_is_taken(testbed):
-    """A rival with the quality of service of `ros2 topic pub`, after which arming is refused."""
+def test_message_from_a_default_publisher_is_received(testbed):
+    """The second publisher has the quality of service of `ros2 topic pub`."""
     rival = testbed.publisher(JointState, 'flywheel_command', 10)
     before = rejected(testbed)
     rival.publish(JointState(name=['nonsense'], effort=[0.0]))

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a testbed is to others: the same of the simulated table and of the prototype on its bus."""
+"""Interface of a device: the same tests for the plant and for the prototype on its bus."""
 
 from math import inf, nan, pi
 import signal
@@ -20,7 +20,7 @@ COMMAND_TIMEOUT_S = 1.0
 TORQUES = [0.004, -0.002, 0.003, -0.004]
 LIMIT = 0.05
 NOTHING = [0.0] * 4
-# Motors fade with 3 ms; less than this is what is left [N m].
+# The motor torque decays with a time constant of 3 ms; a torque below this is zero [N m].
 FADED = 1e-6
 
 JOINT_STATE, STATUS = 'sensor_msgs/msg/JointState', 'diagnostic_msgs/msg/DiagnosticStatus'
@@ -31,7 +31,7 @@ SERVICES = {'arm': 'std_srvs/srv/SetBool', 'emergency_stop': 'std_srvs/srv/Trigg
             'reset_emergency_stop': 'std_srvs/srv/Trigger'}
 SIM = '/sim/'
 
-# Commands that are wrong in one thing each, by the kind under which they are counted.
+# Commands with one defect each, by the counter of their rejection.
 WRONG = {
     'finite': [{'effort': [nan, *NOTHING[1:]]}, {'effort': [0.0, inf, 0.0, 0.0]},
                {'velocity': [0.0, 0.0, -inf, 0.0]}],
@@ -48,9 +48,9 @@ def stamp_of(message):
 
 class Bench:
     """
-    A testbed in a namespace of its own, with a probe that drives it.
+    A device in its own namespace, with a probe that sends commands.
 
-    :ivar name: of the node.
+    :ivar name: name of the node.
     """
 
     def __init__(self, name, processes, probe):
@@ -65,15 +65,15 @@ class Bench:
         return f'/{self.name}/{relative}'
 
     def arm(self):
-        """Ask until it is granted: clocks and limits take a moment."""
+        """Request arming until it is granted: clocks and limits are exchanged first."""
         self.probe.wait(lambda: self.probe.arm().success)
 
     def gives(self, torques):
-        """Tell whether the motors give so much."""
+        """Return whether the motors give these torques."""
         return list(self.newest.effort) == pytest.approx(torques, rel=1e-3, abs=FADED)
 
     def drive(self, torques):
-        """Drive until the motors give so much; arm again if this process was held up."""
+        """Drive until the motors give these torques; arm again after a command timeout."""
         self.probe.drive(torques)
 
         def done():
@@ -106,7 +106,7 @@ def bench(request, module_suite, make_probe):
 
 @pytest.fixture(autouse=True)
 def released(bench):
-    """Leave the testbed disarmed."""
+    """Leave the device disarmed."""
     yield
     bench.probe.drive(NOTHING)
     bench.probe.trigger('reset_emergency_stop')
@@ -116,14 +116,14 @@ def released(bench):
 
 
 def torque_since(bench, begin):
-    """Return the largest torque in the ticks from one on [N m]."""
+    """Return the largest torque in the ticks from an index on [N m]."""
     return max(np.abs(tick.effort).max()
                for tick in bench.probe.received['flywheel_states'][begin:])
 
 
 # Names, types, quality of service
 
-def test_it_publishes_these_topics(bench):
+def test_device_publishes_the_documented_topics(bench):
     node = bench.probe.node
     found = dict(node.get_publisher_names_and_types_by_node(bench.name, f'/{bench.name}'))
     of_devices = {topic: kinds for topic, kinds in found.items()
@@ -138,7 +138,7 @@ def test_it_publishes_these_topics(bench):
             DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
 
 
-def test_it_takes_these_topics(bench):
+def test_device_subscribes_to_the_documented_topics(bench):
     node = bench.probe.node
     found = dict(node.get_subscriber_names_and_types_by_node(bench.name, f'/{bench.name}'))
     for topic, kind in TAKEN.items():
@@ -149,14 +149,14 @@ def test_it_takes_these_topics(bench):
         assert [info.qos_profile.durability for info in of_it] == [DurabilityPolicy.VOLATILE]
 
 
-def test_it_offers_these_services(bench):
+def test_device_offers_the_documented_services(bench):
     found = dict(bench.probe.node.get_service_names_and_types_by_node(
         bench.name, f'/{bench.name}'))
     for service, kind in SERVICES.items():
         assert found[bench.full_name(service)] == [kind]
 
 
-def test_names_are_in_their_order_and_nothing_is_made_up(bench):
+def test_names_are_in_order_and_unused_fields_are_empty(bench):
     tick = bench.probe.more('flywheel_states')[0]
     assert tuple(tick.name) == FLYWHEEL_NAMES
     assert [len(values) for values in (tick.position, tick.velocity, tick.effort)] == [4, 4, 4]
@@ -174,7 +174,7 @@ def test_names_are_in_their_order_and_nothing_is_made_up(bench):
 
 # Rates and stamps
 
-def test_ticks_come_at_the_rate_on_a_grid(bench):
+def test_ticks_have_the_rate_and_are_on_a_grid(bench):
     stamps = [stamp_of(message) for message in bench.probe.more('flywheel_states', 250)]
     steps = np.diff(stamps)
     assert (steps > 0).all()
@@ -184,7 +184,7 @@ def test_ticks_come_at_the_rate_on_a_grid(bench):
 
 
 def test_stamps_of_angles_are_times_of_measurement(bench):
-    """Each link measures 250 times a second, and says so 5 ms later."""
+    """Each link measures at 250 Hz, and the sample arrives 5 ms later."""
     bench.probe.catch_up()
     begin = len(bench.probe.received['flywheel_states'])
     angles = bench.probe.more('link_angles', 300)
@@ -193,7 +193,7 @@ def test_stamps_of_angles_are_times_of_measurement(bench):
         stamps = [stamp_of(message) for message in angles if link in message.name]
         steps = np.diff(stamps)
         assert (steps > 0).all()
-        # To a tenth of a millisecond, which is what a clock over a bus is known to.
+        # The clock of a link is known to a tenth of a millisecond over a bus.
         off = (steps + PERIOD_NS // 2) % PERIOD_NS - PERIOD_NS // 2
         assert np.median(np.abs(off)) < 100_000
         assert np.median(steps) == pytest.approx(PERIOD_NS, abs=100_000)
@@ -209,7 +209,7 @@ def test_nothing_moves_before_it_is_armed(bench):
     assert torque_since(bench, begin) < FADED
 
 
-def test_armed_it_gives_what_it_is_told_and_disarmed_nothing(bench):
+def test_torque_is_as_commanded_while_armed_and_zero_while_disarmed(bench):
     bench.arm()
     assert bench.probe.status('device_status', state='armed')['reason'] == 'armed on request'
     bench.drive(TORQUES)
@@ -218,7 +218,7 @@ def test_armed_it_gives_what_it_is_told_and_disarmed_nothing(bench):
     bench.probe.wait(lambda: bench.gives(NOTHING))
 
 
-def test_second_publisher_of_commands_keeps_it_from_being_armed(bench):
+def test_second_publisher_of_commands_prevents_arming(bench):
     rival = bench.probe.node.create_publisher(JointState, 'flywheel_command', 10)
 
     def refused():
@@ -230,9 +230,9 @@ def test_second_publisher_of_commands_keeps_it_from_being_armed(bench):
     bench.probe.node.destroy_publisher(rival)
 
 
-# Watchdog, emergency stop, limits
+# Command timeout, emergency stop, limits
 
-def test_wheels_coast_when_commands_stay_away(bench):
+def test_wheels_coast_after_the_command_timeout(bench):
     bench.arm()
     bench.drive(TORQUES)
     bench.probe.drive(None)
@@ -282,7 +282,7 @@ def test_too_much_torque_is_clipped_and_counted(bench):
 # Commands
 
 @pytest.mark.parametrize('kind', list(WRONG))
-def test_wrong_command_is_rejected_whole_and_counted(bench, kind):
+def test_command_with_a_defect_is_rejected_as_a_whole_and_counted(bench, kind):
     bench.arm()
     before = bench.counts('commands_rejected_', fresh=False).get(kind, 0)
     begin = len(bench.probe.received['flywheel_states'])
@@ -304,7 +304,7 @@ def test_stale_command_is_rejected(bench, away_ns):
     assert torque_since(bench, begin) < FADED
 
 
-def test_wheels_are_found_by_name_and_one_that_is_not_named_has_no_torque(bench):
+def test_wheels_are_addressed_by_name_and_a_missing_one_has_no_torque(bench):
     bench.arm()
     bench.probe.drive(None)
 

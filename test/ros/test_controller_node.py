@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The controller over DDS: trajectories, what it may be told, and a wheel that breaks."""
+"""The controller over DDS: trajectories, services, scalars, gains, and a dead wheel."""
 
 from math import nan, pi
 
@@ -16,12 +16,11 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 pytestmark = pytest.mark.node
 
-# Slow enough that not all gains are stable, and that two cores have time to spare.
+# The rate is low, so that some gains are unstable and two cores suffice [Hz].
 RATE = 50.0
 PERIOD = 1.0 / RATE
 
-# Refused trajectories: names, points (positions, time, and what else there is), and a word of the
-# reason.
+# Refused trajectories: names, points (positions, time, further fields), and a word of the reason.
 WRONG = {
     'no points': (['link_a'], [], 'point'),
     'unknown': (['link_x'], [([0.1], 5.0, {})], 'link_x'),
@@ -52,7 +51,7 @@ def trajectory(names, points):
 
 
 def set_value(probe, node, name, value):
-    """Set a parameter: whether it was accepted, and the reason."""
+    """Set a parameter; return whether it was accepted, and the reason."""
     given = (ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=value)
              if isinstance(value, str) else
              ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value))
@@ -82,7 +81,7 @@ def started(nodes, probe):
 
 @pytest.fixture
 def testbed(started):
-    """Let it hold at rest."""
+    """Return the probe with the controller in mode hold, at rest."""
     status = started.status('controller_status')
     if status['mode'] == 'idle':
         assert started.call(SetBool, 'enable', SetBool.Request(data=True)).success
@@ -96,7 +95,7 @@ def testbed(started):
 
 
 def reference(testbed):
-    """Return where the links are told to be now."""
+    """Return the present reference [rad]."""
     return np.array(testbed.more('reference')[0].position)
 
 
@@ -105,11 +104,11 @@ def reference(testbed):
 def test_trajectory_is_followed_through_its_points(testbed, publisher):
     begin, count = reference(testbed), len(testbed.received['reference'])
     points = [(1.0, [0.05, 0.02]), (2.0, [0.02, -0.03]), (3.5, [-0.04, 0.0])]
-    verdict = testbed.setpoint_verdict(
+    decision = testbed.setpoint_decision(
         trajectory(['link_a', 'link_b'],
                    [((begin[:2] + by).tolist(), time, {}) for time, by in points]), publisher)
-    assert verdict['mode'] == 'track'
-    goal = [float(item.split('=')[1]) for item in verdict['goal'].split()]
+    assert decision['mode'] == 'track'
+    goal = [float(item.split('=')[1]) for item in decision['goal'].split()]
     assert goal[:2] == pytest.approx(begin[:2] + points[-1][1], abs=2e-6)
 
     testbed.status('controller_status', mode='hold')
@@ -117,28 +116,28 @@ def test_trajectory_is_followed_through_its_points(testbed, publisher):
     assert reference(testbed)[:2] == pytest.approx(begin[:2] + points[-1][1], abs=1e-9)
     moved = testbed.received['reference'][count:]
     first = next(n for n, message in enumerate(moved) if any(message.velocity))
-    # It starts at the tick before the first that moves.
+    # The trajectory starts at the tick before the first motion.
     start_ns = stamp_of(moved[first]) - round(PERIOD * 1e9)
     times = np.array([(stamp_of(message) - start_ns) * 1e-9 for message in moved])
     for time, by in points:
         at = np.array(moved[int(np.argmin(np.abs(times - time)))].position)
-        # Of a tick, at the rates of these points at most 0.2 rad/s.
+        # The tick may be off by one; the rate is at most 0.2 rad/s.
         assert at[:2] == pytest.approx(begin[:2] + by, abs=0.2 * PERIOD)
     steps = np.diff([message.position[:2] for message in moved], axis=0)
     assert np.abs(steps).max() < 0.2 * PERIOD * 1.5
 
 
-def test_refused_trajectories_are_counted_and_say_why(testbed, publisher, nodes):
-    """Where it stands it stays; on the log, in status and diagnostics."""
+def test_refused_trajectories_are_counted_and_reported_with_the_reason(testbed, publisher, nodes):
+    """The reference does not change; log, status and diagnostics contain the reason."""
     before = testbed.status('controller_status')
     held = reference(testbed)
     for number, (what, (names, points, word)) in enumerate(WRONG.items(), 1):
-        verdict = testbed.setpoint_verdict(trajectory(names, points), publisher)
-        assert word in verdict['last_refusal'], what
-        assert int(verdict['refused']) == int(before['refused']) + number, what
-        assert verdict['accepted'] == before['accepted'], what
-        assert (verdict['mode'], verdict['goal']) == ('hold', before['goal']), what
-    wanted = {'setpoints_refused': verdict['refused'], 'last_refusal': verdict['last_refusal']}
+        decision = testbed.setpoint_decision(trajectory(names, points), publisher)
+        assert word in decision['last_refusal'], what
+        assert int(decision['refused']) == int(before['refused']) + number, what
+        assert decision['accepted'] == before['accepted'], what
+        assert (decision['mode'], decision['goal']) == ('hold', before['goal']), what
+    wanted = {'setpoints_refused': decision['refused'], 'last_refusal': decision['last_refusal']}
     status = testbed.diagnostics('controller', lambda status: wanted.items() <= {
         item.key: item.value for item in status.values}.items())
     assert status.level == DiagnosticStatus.WARN
@@ -152,9 +151,9 @@ def test_refused_trajectories_are_counted_and_say_why(testbed, publisher, nodes)
 def move(testbed, publisher):
     """Begin a move that takes five seconds."""
     begin = reference(testbed)
-    verdict = testbed.setpoint_verdict(
+    decision = testbed.setpoint_decision(
         trajectory(['link_a'], [([float(begin[0]) + 0.3], 5.0, {})]), publisher)
-    assert verdict['mode'] == 'track'
+    assert decision['mode'] == 'track'
     messages = testbed.received['reference']
     testbed.wait(lambda: abs(messages[-1].velocity[0]) > 0.02)
 
@@ -168,7 +167,7 @@ def test_hold_stops_a_move(testbed, publisher):
     testbed.wait(lambda: not any(messages[-1].velocity), seconds=3.0)
 
 
-def test_damp_lets_the_reference_go(testbed, publisher):
+def test_damp_ends_the_reference_motion(testbed, publisher):
     move(testbed, publisher)
     response = testbed.trigger('damp')
     assert (response.success, response.message) == (True, 'stops all rates')
@@ -176,7 +175,7 @@ def test_damp_lets_the_reference_go(testbed, publisher):
     assert not any(any(message.velocity) for message in testbed.more('reference', 10)[1:])
 
 
-def test_idle_controller_gives_no_torque_and_takes_nothing(testbed, publisher):
+def test_idle_controller_gives_no_torque_and_refuses_trajectories(testbed, publisher):
     response = testbed.call(SetBool, 'enable', SetBool.Request(data=False))
     assert (response.success, response.message) == (
         True, 'not enabled: the wheels get no torque')
@@ -187,17 +186,17 @@ def test_idle_controller_gives_no_torque_and_takes_nothing(testbed, publisher):
         response = testbed.trigger(service)
         assert not response.success
         assert 'not enabled' in response.message
-    verdict = testbed.setpoint_verdict(trajectory(['link_a'], [([0.1], 5.0, {})]), publisher)
-    assert 'not enabled' in verdict['last_refusal']
+    decision = testbed.setpoint_decision(trajectory(['link_a'], [([0.1], 5.0, {})]), publisher)
+    assert 'not enabled' in decision['last_refusal']
     response = testbed.call(SetBool, 'enable', SetBool.Request(data=True))
     assert (response.success, response.message) == (True, 'enabled')
     testbed.status('controller_status', mode='hold')
 
 
-# What it tells
+# Scalars
 
 @pytest.mark.parametrize('topic', ['allocation', 'momentum'])
-def test_scalars_are_finite_while_it_moves(topic, testbed, publisher):
+def test_scalars_are_finite_during_a_move(topic, testbed, publisher):
     move(testbed, publisher)
     messages = testbed.more(topic, 5)
     for message in messages:
@@ -206,17 +205,17 @@ def test_scalars_are_finite_while_it_moves(topic, testbed, publisher):
     found = dict(zip(messages[-1].name, messages[-1].position))
     if topic == 'allocation':
         assert found['scale'] == 1.0
-        # Links of a rhombus: cond(A) is 1.
+        # The links form a rhombus, so cond(A) is 1.
         assert found['condition_number'] == pytest.approx(1.0, abs=1e-6)
     else:
-        # On a table without friction: rounding of encoders and noise of the estimate.
+        # The table has no friction; encoder resolution and estimation noise remain.
         assert abs(found['total_n_m_s']) < 1e-6
         assert 0.0 < found['margin'] < 1.0
 
 
 # Gains
 
-def test_gains_that_are_unstable_at_this_rate_are_refused(testbed):
+def test_gains_that_are_unstable_at_the_rate_are_refused(testbed):
     assert set_value(testbed, 'controller', 'damping', 2.0) == (True, '')
     accepted, reason = set_value(testbed, 'controller', 'bandwidth', 20.0)
     assert not accepted
@@ -229,9 +228,9 @@ def test_gains_that_are_unstable_at_this_rate_are_refused(testbed):
     assert testbed.status('controller_status', mode='hold')['problem'] == ''
 
 
-# A wheel that breaks, last: what it is found to be stays until the device is disarmed.
+# A dead wheel; the last test, because the controller keeps the fault until it is disarmed
 
-def test_dead_wheel_is_named_in_the_status_and_no_longer_in_commands(testbed, publisher):
+def test_dead_wheel_is_named_in_the_status_and_missing_in_commands(testbed, publisher):
     move(testbed, publisher)
     assert set_value(testbed, 'plant', 'fault.flywheel_a', 'dead') == (True, '')
     statuses = testbed.received['controller_status']
@@ -244,7 +243,7 @@ def test_dead_wheel_is_named_in_the_status_and_no_longer_in_commands(testbed, pu
     for message in testbed.more('flywheel_command', 20)[2:]:
         assert message.name == list(FLYWHEEL_NAMES[1:])
         assert len(message.effort) == 3
-    # The others go on, and the move ends.
+    # The other wheels complete the move.
     status = testbed.status('controller_status', mode='hold')
     assert status['problem'] == ''
     assert set_value(testbed, 'plant', 'fault.flywheel_a', 'none') == (True, '')

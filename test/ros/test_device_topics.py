@@ -16,7 +16,7 @@ WHEELS = ['flywheel_a', 'flywheel_b', 'flywheel_c', 'flywheel_d']
 ANGLE_AND_RATE = ('position', 'velocity')
 ALL = ('position', 'velocity', 'effort')
 
-# Names and used arrays of every JointState, by publisher.
+# Names and non-empty arrays of every JointState, by publisher.
 JOINT_STATES = {
     'plant': {
         'link_angles': (LINKS, ('position',)),
@@ -58,7 +58,7 @@ JOINT_STATES = {
 TOPICS = {topic: form for topics in JOINT_STATES.values() for topic, form in topics.items()}
 STATUSES = {'plant': 'device_status', 'controller': 'controller_status'}
 
-# What each node takes, and whether it insists on every message.
+# Subscriptions of each node, and whether they are reliable.
 SUBSCRIPTIONS = {
     'plant': {'flywheel_command': True, 'emergency_stop_request': True},
     'estimator': {'link_angles': False, 'flywheel_states': False},
@@ -75,7 +75,7 @@ SERVICES = {
                    '/damp': 'std_srvs/srv/Trigger'},
 }
 JOINT_STATE, STATUS = 'sensor_msgs/msg/JointState', 'diagnostic_msgs/msg/DiagnosticStatus'
-# What every node of rclpy has.
+# Topics of every node of rclpy.
 OF_ROS = {'/rosout', '/parameter_events'}
 
 each_node = pytest.mark.parametrize('name', list(JOINT_STATES))
@@ -98,7 +98,7 @@ def testbed(module_suite, probe):
 
 @pytest.fixture(autouse=True)
 def all_topics_are_not_followed_at_once(testbed):
-    """Twelve of them take as much of the machine as the nodes do."""
+    """End the subscriptions after a test: twelve of them need as much time as the nodes."""
     testbed.unfollow()
 
 
@@ -107,7 +107,7 @@ def types_by_name(pairs):
 
 
 @each_node
-def test_node_publishes_just_its_topics(testbed, name):
+def test_node_publishes_exactly_its_topics(testbed, name):
     expected = {f'/{topic}': JOINT_STATE for topic in JOINT_STATES[name]}
     expected['/diagnostics'] = 'diagnostic_msgs/msg/DiagnosticArray'
     if name in STATUSES:
@@ -121,7 +121,7 @@ def test_node_publishes_just_its_topics(testbed, name):
 
 
 @each_node
-def test_node_subscribes_to_just_its_topics(testbed, name):
+def test_node_subscribes_to_exactly_its_topics(testbed, name):
     found = types_by_name(testbed.node.get_subscriber_names_and_types_by_node(name, '/'))
     special = {'/device_status': STATUS, '/emergency_stop_request': 'std_msgs/msg/Bool',
                '/trajectory': 'trajectory_msgs/msg/JointTrajectory'}
@@ -130,7 +130,7 @@ def test_node_subscribes_to_just_its_topics(testbed, name):
 
 
 @each_node
-def test_node_offers_just_its_services(testbed, name):
+def test_node_offers_exactly_its_services(testbed, name):
     found = testbed.node.get_service_names_and_types_by_node(name, '/')
     assert {service: types[0] for service, types in found
             if not service.startswith(f'/{name}/')} == SERVICES[name]
@@ -153,23 +153,23 @@ def test_publishers_are_reliable_and_only_statuses_latched(testbed, name):
 
 
 @each_node
-def test_subscribers_ask_for_no_more_than_they_need(testbed, name):
+def test_subscribers_request_the_documented_quality_of_service(testbed, name):
     for topic, reliable in SUBSCRIPTIONS[name].items():
         wanted, = [info.qos_profile for info in
                    testbed.node.get_subscriptions_info_by_topic(f'/{topic}')
                    if info.node_name == name]
         assert (topic, wanted.reliability == ReliabilityPolicy.RELIABLE) == (topic, reliable)
-        # A latched subscriber would never hear what `ros2 topic pub` sends.
+        # A latched subscriber does not receive from the volatile publisher of `ros2 topic pub`.
         latched = wanted.durability == DurabilityPolicy.TRANSIENT_LOCAL
         assert (topic, latched) == (topic, topic in STATUSES.values())
 
 
 @pytest.mark.parametrize('topic', list(TOPICS))
-def test_names_are_in_their_order_and_unused_arrays_empty(testbed, topic):
+def test_names_are_in_order_and_unused_arrays_are_empty(testbed, topic):
     names, fields = TOPICS[topic]
     for message in testbed.more(topic, 50):
-        # A tick that nobody answered has no round trip, wheels that do not drift no time to
-        # their limit: what was not measured is left out.
+        # A tick without an answer has no round trip, and wheels without drift have no time to
+        # their limit: the message omits them.
         unmeasured = {'round_trip_s', 'time_left_s'} - set(message.name)
         assert message.name == [name for name in names if name not in unmeasured]
         for field in ALL:
@@ -179,8 +179,8 @@ def test_names_are_in_their_order_and_unused_arrays_empty(testbed, topic):
         assert message.header.stamp.sec > 0
 
 
-def test_link_angles_are_wrapped_wherever_the_links_are(make_probe, module_suite):
-    """With link a at half a turn noise takes the measured angle across it all the time."""
+def test_link_angles_are_wrapped_at_half_a_turn(make_probe, module_suite):
+    """Link a is at half a turn, so the noise changes the sign of the measured angle often."""
     module_suite.node('plant', {'initial.link_a': pi, 'initial.link_b': 20.0}, '/turned')
     watcher = make_probe('/turned')
     watcher.follow('link_angles', 'sim/link_states')
@@ -200,7 +200,7 @@ def test_timing_of_a_running_loop_is_plausible(testbed):
         assert timing['lost'] == int(timing['lost']) >= 0
 
 
-def test_timing_leaves_out_what_is_not_known(make_probe, module_suite):
+def test_timing_omits_unknown_values(make_probe, module_suite):
     module_suite.node('plant', namespace='/alone')
     watcher = make_probe('/alone')
     watcher.follow('timing')
@@ -220,15 +220,15 @@ def test_diagnostics_come_every_second_from_every_node(testbed):
     for name in JOINT_STATES:
         stamps = [array.header.stamp.sec + array.header.stamp.nanosec * 1e-9
                   for array in arrays[begin:] if array.status[0].name == name]
-        # Three in no more than two seconds and what a busy machine takes.
+        # Three messages take two seconds; two more are a margin for a busy machine.
         assert stamps[2] - stamps[0] < 4.0
 
 
 @each_node
-def test_healthy_node_says_so(testbed, name):
+def test_healthy_node_reports_ok(testbed, name):
     status = testbed.diagnostics(name)
     values = {item.key: item.value for item in status.values}
-    # On a busy machine a sample may be overtaken by a tick, which is said and nothing worse.
+    # On a busy machine a sample may arrive after its tick, which is a warning.
     overtaken = name == 'estimator' and status.message == 'running, measurements were rejected'
     assert status.level == (b'\x01' if overtaken else b'\x00'), values
     assert {key for key in values if key.startswith('rejected_')} <= {'rejected_late'}
@@ -245,7 +245,7 @@ def test_statuses_have_their_keys(testbed):
     assert (controller['problem'], controller['wheel_faults']) == ('', '')
 
 
-def test_late_joiner_gets_both_statuses(testbed, make_probe):
+def test_late_subscriber_receives_both_statuses(testbed, make_probe):
     testbed.arm()
     armed = testbed.status('device_status', state='armed')
     held = testbed.status('controller_status', mode='hold')
@@ -259,7 +259,7 @@ def test_late_joiner_gets_both_statuses(testbed, make_probe):
 
 
 def test_odometry_is_that_of_link_a(testbed):
-    """Orientation of link a; while nothing moves the mass centre, joint 1 turns about it."""
+    """The orientation is that of link a; joint 1 turns about the mass centre, which is at rest."""
     odometry = testbed.follow('sim/odometry', kind=Odometry)
     testbed.wait(lambda: len(odometry) > 50)
     testbed.follow('sim/link_states')
@@ -272,8 +272,8 @@ def test_odometry_is_that_of_link_a(testbed):
     angle = link.position[0]
     orientation = message.pose.pose.orientation
     assert 2.0 * atan2(orientation.z, orientation.w) == pytest.approx(angle, abs=1e-9)
-    # The mass centre of the rhombus stays in the origin; joint 1 is half a link a and half a link
-    # b away from it.
+    # The mass centre of the rhombus stays in the origin; joint 1 is half of link a and half of
+    # link b away from it.
     place = message.pose.pose.position
     other = link.position[1]
     assert [place.x, place.y] == pytest.approx(

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is wrong with the ROS of this machine is said in one line, before anything starts."""
+"""Commands report an unusable ROS environment in one line, before they start a process."""
 
 import os
 import subprocess
@@ -24,7 +24,7 @@ Version: {version}
 
 
 def run(folder, name, *arguments, code=None, **variables):
-    """Run a command to its end, which must come before anything is started."""
+    """Run a command to its end, which comes before the start of a process."""
     command = ['-c', code] if code else ['-m', 'fourbar_ros', name, *arguments]
     done = subprocess.run(
         [sys.executable, *command], cwd=folder, env={**os.environ, **variables},
@@ -43,7 +43,7 @@ def assert_one_line(result, name, *words):
 
 @pytest.fixture
 def foreign(tmp_path):
-    """Return a function that puts another rclpy in front of ours."""
+    """Return a function that puts another rclpy first in the search path."""
     def make(version):
         folder = tmp_path / 'other_ros'
         (folder / 'rclpy').mkdir(parents=True)
@@ -71,7 +71,7 @@ def test_bad_domain_is_refused(monkeypatch, refuses, domain):
 
 
 @pytest.mark.parametrize('domain', ['', '0', '42', '101', '232'])
-def test_good_domain_is_taken(monkeypatch, domain):
+def test_good_domain_is_accepted(monkeypatch, domain):
     monkeypatch.setenv('ROS_DOMAIN_ID', domain)
     environment.check_environment()
 
@@ -82,7 +82,7 @@ def test_middleware_that_is_not_installed_is_named(tmp_path, name):
     assert_one_line(result, name, 'RMW_IMPLEMENTATION', 'rmw_nonsense_cpp')
 
 
-def test_middleware_that_is_installed_is_taken(monkeypatch):
+def test_middleware_that_is_installed_is_accepted(monkeypatch):
     monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')
     environment.check_environment()
 
@@ -99,13 +99,13 @@ def test_rclpy_of_another_version_is_refused(tmp_path, foreign, version):
     assert_one_line(result, 'plant', f'rclpy {version}')
 
 
-def test_missing_rclpy_is_said(tmp_path):
+def test_missing_rclpy_is_reported(tmp_path):
     code = ('import sys; sys.modules["rclpy"] = None; '
             'from fourbar_ros.cli.main import main; sys.exit(main(["plant"]))')
     assert_one_line(run(tmp_path, 'plant', code=code), 'plant', 'rclpy is missing')
 
 
-def test_commands_without_ros_need_none(tmp_path, foreign):
+def test_commands_that_do_not_use_ros_run_without_it(tmp_path, foreign):
     wrong = {'PYTHONPATH': foreign('3.3.1'), 'RMW_IMPLEMENTATION': 'rmw_nonsense_cpp',
              'ROS_DOMAIN_ID': 'banana'}
     for arguments in (['--help'], ['simulate', '--help'], ['report', '--help']):

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the estimator makes of ticks and samples that no plant of ours would send."""
+"""The estimator node with ticks and samples that the devices of the package never send."""
 
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, LINK_NAMES
 import pytest
@@ -16,9 +16,9 @@ ANGLES = [0.1, 1.2, 0.1, 1.2]
 
 class Device:
     """
-    Publishes ticks with what one says they hold, and samples.
+    A publisher of samples, and of ticks with given fields.
 
-    :param testbed: the probe that does it.
+    :param testbed: probe that publishes.
     """
 
     def __init__(self, testbed):
@@ -44,11 +44,11 @@ class Device:
             self._wheels.publish(self._message(FLYWHEEL_NAMES, **wheels))
             self._testbed.catch_up()
             return len(self._estimates) > before
-        # What is sent before the estimator has discovered who sends it is lost.
+        # The estimator loses messages that are sent before it has discovered the publisher.
         self._testbed.wait(answered)
 
     def command(self, efforts):
-        """Command the wheels; the estimator listens only after it had to do without."""
+        """Command the wheels; the estimator subscribes only after a tick without efforts."""
         self._testbed.publisher(JointState, 'flywheel_command').publish(
             self._message(FLYWHEEL_NAMES, effort=efforts))
 
@@ -65,8 +65,8 @@ def device(namespace, make_probe):
     return namespace, testbed, Device(testbed)
 
 
-def test_wheels_that_are_not_measured_are_never_passed_over(device):
-    """By effort, then by command, then by speed again: each is said."""
+def test_missing_wheel_speeds_are_replaced_and_reported(device):
+    """Efforts, then commands, then speeds again drive the prediction; diagnostics name each."""
     namespace, testbed, plant = device
 
     def driven(by):
@@ -82,12 +82,12 @@ def test_wheels_that_are_not_measured_are_never_passed_over(device):
     assert driven('nothing') == 'running without wheel speeds, driven by nothing'
     plant.command([1e-6] * 4)
 
-    def heard():
+    def driven_by_commands():
         plant.tick()
         return any(item.key == 'driven_by' and item.value == 'commanded efforts'
                    for status in [testbed.diagnostics(f'{namespace[1:]}/estimator')]
                    for item in status.values)
-    testbed.wait(heard)
+    testbed.wait(driven_by_commands)
     plant.tick(velocity=[0.0] * 4)
     plant.tick(velocity=[0.0] * 4)
     assert driven('wheel speeds') == 'running'
@@ -100,10 +100,10 @@ def test_gyros_and_decisions_are_published(device):
     disturbances = testbed.follow('estimate/disturbance')
     assert not testbed.node.count_publishers(testbed.node.resolve_topic_name('estimate/gyro_bias'))
 
-    def heard():
+    def published():
         plant.tick(rates=[0.01, 0.02, -0.01, 0.0], velocity=[0.0] * 4)
         return biases and decisions and disturbances
-    testbed.wait(heard)
+    testbed.wait(published)
     assert list(biases[-1].name) == list(LINK_NAMES) and len(biases[-1].velocity) == 4
     assert list(decisions[-1].name) == list(LINK_NAMES)
     assert list(decisions[-1].position) == [0.0] * 4

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults of sensors and wheels, set at run time and by a schedule, as the topics show them."""
+"""Effect on the topics of sensor and wheel faults, set at run time and by a schedule."""
 
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -20,14 +20,14 @@ def testbed(module_suite, probe):
 
 
 def set_fault(testbed, name, text):
-    """Set a parameter: whether it was accepted, and the reason."""
+    """Set a parameter; return whether it was accepted, and the reason."""
     value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=text)
     result, = testbed.call(SetParameters, 'plant/set_parameters', SetParameters.Request(
         parameters=[Parameter(name=name, value=value)])).results
     return result.successful, result.reason
 
 
-def test_sensor_that_is_off_is_left_out_and_comes_back(testbed):
+def test_sensor_with_fault_off_is_missing_until_the_fault_ends(testbed):
     assert set_fault(testbed, 'fault.link_c', 'off') == (True, '')
     testbed.wait(lambda: list(testbed.received['link_angles'][-1].name) == [
         'link_a', 'link_b', 'link_d'])
@@ -35,7 +35,7 @@ def test_sensor_that_is_off_is_left_out_and_comes_back(testbed):
     testbed.wait(lambda: len(testbed.received['link_angles'][-1].name) == 4)
 
 
-def test_wrong_sensor_is_wrong_by_so_much(testbed):
+def test_wrong_sensor_has_the_given_error(testbed):
     assert set_fault(testbed, 'fault.link_b', 'wrong 0.5')[0]
     status = testbed.diagnostics('plant', lambda status: 'faults' in status.message)
     assert {item.key: item.value for item in status.values}['faults'] == 'link_b wrong 0.5'
@@ -44,8 +44,8 @@ def test_wrong_sensor_is_wrong_by_so_much(testbed):
     assert set_fault(testbed, 'fault.link_b', 'none')[0]
 
 
-def test_estimator_leaves_out_a_wrong_sensor_and_says_so(suite, make_probe):
-    """The estimate stays with the truth, by far less than the sensor is off."""
+def test_estimator_gates_a_wrong_sensor_and_reports_it(suite, make_probe):
+    """The error of the estimate is far smaller than the error of the sensor."""
     watch = make_probe('/wrong')
     for name, parameters in (('plant', {'rate': 100.0}), ('estimator', {})):
         suite.node(name, parameters, '/wrong')
@@ -81,8 +81,8 @@ def test_dead_wheel_gives_no_torque(testbed):
 
 
 @pytest.mark.parametrize(('kind', 'cut'), [('runaway', True), ('shorted', False)])
-def test_wheel_that_is_not_named_loses_its_power(kind, cut, testbed):
-    """Which ends a runaway, as disarming does, and no short."""
+def test_wheel_missing_in_a_command_loses_its_power(kind, cut, testbed):
+    """Loss of power ends a runaway, as disarming does, and does not end a short circuit."""
     def efforts():
         return list(testbed.received['sim/flywheel_states'][-1].effort)
 
@@ -112,7 +112,7 @@ def test_wheel_that_is_not_named_loses_its_power(kind, cut, testbed):
     ('fault.joint_1', 'off', 'no joint_1'),
     ('fault.flywheel_a', 'weak x', "'x'"),
     ('fault_schedule', '/nowhere/faults.yaml', '/nowhere/faults.yaml')])
-def test_fault_that_cannot_be_is_refused_and_changes_nothing(testbed, name, text, word):
+def test_invalid_fault_is_refused_and_has_no_effect(testbed, name, text, word):
     accepted, reason = set_fault(testbed, name, text)
     assert not accepted
     assert word in reason
@@ -130,7 +130,7 @@ def test_schedule_is_followed_from_the_start(suite, make_probe, tmp_path):
     testbed.wait(lambda: any(len(message.name) == 3 for message in angles))
     testbed.wait(lambda: len(angles[-1].name) == 4)
     missing = [message for message in angles if len(message.name) == 3]
-    # Half a second of 100 Hz; what a busy machine skipped is not there.
+    # The fault lasts half a second at 100 Hz; a busy machine may skip ticks.
     assert len(missing) <= 50
     assert list(missing[0].name) == ['link_b', 'link_c', 'link_d']
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What only the prototype on its bus has: links that are lost, late, hot or start anew."""
+"""The hardware node on a bus: order of start, end, lost, overheated and restarted links."""
 
 from contextlib import ExitStack
 import signal
@@ -23,25 +23,26 @@ from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomic
 pytestmark = pytest.mark.node
 
 NOTHING = [0.0] * 4
-# Some more than the friction of the bearings, so that no wheel is too fast to be armed again.
+# Slightly more than the bearing friction, so that every wheel stays slow enough for arming [N m].
 TORQUES = [0.002, -0.002, 0.002, -0.002]
-# Motors fade with 3 ms; less than this is what is left [N m].
+# The motor torque decays with a time constant of 3 ms; a torque below this is zero [N m].
 FADED = 1e-6
-# How long the links go on without a command, and until nothing is left then [ns].
+# Command timeout of the emulated links [s].
 LINKS_S = 0.1
-# Others forget a node that died after 20 s.
+# Time limit for the discovery to drop a dead node, which takes 20 s on a quiet machine [s].
 FORGOTTEN_S = 60.0
+# Time limit from the last command to zero torque: LINKS_S and a margin [ns].
 COASTING_NS = 150_000_000
-# Ticks end with the wheels' silence: the limit of the safety table and the same margin [ns].
+# Time limit from a bus fault to the last tick: rule `wheel_silent` and a margin [ns].
 SILENT_NS = 500_000_000 + 100_000_000
-# A node that ends says so at once; of this much more a busy machine may make [ns].
+# Time limit for an immediate reaction on a busy machine [ns].
 AT_ONCE_NS = 2_500_000_000
-# So old is a message at most that nobody kept waiting [ns].
+# Largest age of a message that was delivered without a delay [ns].
 YOUNG_NS = 100_000_000
-# Two seconds, and what a busy machine takes.
+# Time limit for the end of a node: two seconds, and a margin for a busy machine [s].
 SHUTDOWN_S = 2.0 + 3.0
 
-TROUBLES = ('trouble.bus', *(f'trouble.{name}' for name in LINK_NAMES))
+FAULT_PARAMETERS = ('trouble.bus', *(f'trouble.{name}' for name in LINK_NAMES))
 
 
 def stamp_of(message):
@@ -57,7 +58,7 @@ def largest_torque(wheels):
 
 
 def free_channels(count):
-    """Return addresses on this machine that nobody uses."""
+    """Return unused addresses on this machine."""
     with ExitStack() as stack:
         ends = [stack.enter_context(socket(AF_INET, SOCK_DGRAM)) for _ in range(count)]
         for end in ends:
@@ -78,11 +79,11 @@ def text_parameter(name, value):
 
 class Bench:
     """
-    Hardware node and emulated links in a namespace of their own, with a probe that drives.
+    Hardware node and emulated links in their own namespace, with a probe that sends commands.
 
     :param name: of the namespace.
-    :param links_s: how long the links go on without a command [s].
-    :ivar host, ear: channels of the host, and of somebody else who may listen.
+    :param links_s: command timeout of the emulated links [s].
+    :ivar host, ear: channels of the host, and of a third end that only listens.
     """
 
     def __init__(self, suite, make_probe, name, links_s=LINKS_S, fresh=False):
@@ -103,11 +104,11 @@ class Bench:
         self.probe.status('device_status')
 
     def arm(self):
-        """Ask until it is granted: clocks and limits take a moment."""
+        """Request arming until it is granted: clocks and limits are exchanged first."""
         self.probe.wait(lambda: self.probe.arm().success)
 
     def drive(self):
-        """Drive until the motors do as they are told; arm again if somebody was held up."""
+        """Drive until the motors give TORQUES; arm again after a command timeout."""
         self.arm()
         self.probe.drive(TORQUES)
 
@@ -118,46 +119,46 @@ class Bench:
         self.probe.wait(done)
 
     def set_parameter(self, name, value):
-        """Set a parameter of the emulator: whether it was accepted, and the reason."""
+        """Set a parameter of the emulator; return whether it was accepted, and the reason."""
         result, = self.probe.call(
             SetParameters, 'prototype_emulator/set_parameters',
             SetParameters.Request(parameters=[text_parameter(name, value)])).results
         return result.successful, result.reason
 
-    def trouble(self, target, kind):
-        """Make trouble, and return the system times between which it began [ns]."""
+    def inject(self, target, kind):
+        """Inject a fault; return the system times between which it begins [ns]."""
         before_ns = time.time_ns()
         assert self.set_parameter(f'trouble.{target}', kind) == (True, '')
         return before_ns, time.time_ns()
 
     def last_driven_ns(self):
-        """Wait until no motor gives torque any more, and return when one last did [ns]."""
+        """Wait until no motor gives torque; return the last stamp with torque [ns]."""
         self.probe.wait(lambda: largest_torque(self.truth[-1]) < FADED)
         return max(stamp_of(message) for message in self.truth
                    if largest_torque(message) > FADED)
 
     def assert_nothing_moves(self):
-        """No motor gives torque, for some time from now on."""
+        """Check that no motor gives torque in the next 50 messages."""
         for message in self.probe.more('sim/flywheel_states', 50):
             assert largest_torque(message) < FADED
 
     def diagnostics(self, condition=lambda values: True):
-        """Wait for what the hardware node tells in /diagnostics, and return it."""
+        """Wait for values of the hardware node in /diagnostics that fulfil a condition."""
         return values_of(self.probe.diagnostics(
             f'{self.name}/hardware', lambda status: condition(values_of(status))))
 
 
 @pytest.fixture(scope='module')
 def shared(module_suite, make_probe):
-    """Start one for all tests that leave it as it was."""
+    """Start one bench for all tests that restore its state."""
     return Bench(module_suite, make_probe, 'bench')
 
 
 @pytest.fixture
 def bench(shared):
-    """Return the shared one, and mend it afterwards."""
+    """Return the shared bench; remove faults and disarm after the test."""
     yield shared
-    for name in TROUBLES:
+    for name in FAULT_PARAMETERS:
         shared.set_parameter(name, '')
     shared.probe.drive(NOTHING)
     shared.probe.newest('flywheel_states')
@@ -166,10 +167,10 @@ def bench(shared):
     shared.probe.status('device_status', state='disarmed')
 
 
-# Bad input: first, as long as nothing else runs
+# Bad input: first, while no other node runs
 
 def write_changed(folder, name, old, new):
-    """Write a changed copy of one of our files, and return its path."""
+    """Write a changed copy of a file of the package, and return its path."""
     text = (share_directory() / 'config' / name).read_text()
     assert old in text
     path = folder / name
@@ -177,12 +178,12 @@ def write_changed(folder, name, old, new):
     return path
 
 
-# By node: parameters, of which `{...}` are files that are no good, and words of the one line.
+# By case: node, parameters (`{...}` is an invalid file), and parts of the error message.
 BUS = on_bus('127.0.0.1:0', '127.0.0.1:9')
 BAD = {
     'unknown interface': (
         'hardware', {'bus.interface': 'smoke'}, 'smoke can0: no such interface', 'socketcan'),
-    # What is missing depends on the machine: the interface, or CAN in the kernel.
+    # The machine lacks either the interface or CAN in the kernel.
     'channel that is not there': (
         'hardware', {'bus.channel': 'can77'}, 'socketcan can77: ', ' no '),
     'port in use': (
@@ -217,17 +218,17 @@ BAD = {
 @pytest.fixture(scope='module')
 def refused(module_suite, tmp_path_factory):
     """
-    Start nodes with bad input, all at once, and wait for their ends.
+    Start nodes with bad input in parallel, and wait until they end.
 
-    :returns: each with the words that it should have said.
+    :returns: process and expected parts of its error message, by case.
     """
     folder = tmp_path_factory.mktemp('bad')
     no_dbc = folder / 'no.dbc'
     no_dbc.write_text('good morning\n')
-    with socket(AF_INET, SOCK_DGRAM) as somebody:
-        somebody.bind(('127.0.0.1', 0))
+    with socket(AF_INET, SOCK_DGRAM) as taken:
+        taken.bind(('127.0.0.1', 0))
         files = {
-            'taken': f'127.0.0.1:{somebody.getsockname()[1]}', 'no_dbc': no_dbc,
+            'taken': f'127.0.0.1:{taken.getsockname()[1]}', 'no_dbc': no_dbc,
             'dbc': write_changed(folder, 'prototype.dbc', 'BO_ 128 SYNC:', 'BO_ 128 SINK:'),
             'safety': write_changed(
                 folder, 'safety_prototype.yaml',
@@ -256,8 +257,8 @@ def test_bad_input_ends_a_node_with_one_line(refused, case):
 
 # Order of start
 
-def test_links_may_come_late_and_who_is_missing_is_named(suite, make_probe):
-    """First none, then all but one, then that one too, which is a bus of three ends by then."""
+def test_links_may_start_after_the_host_and_missing_links_are_named(suite, make_probe):
+    """No link at first, then three links, then the fourth on a third end of the bus."""
     host, some, last = free_channels(3)
     suite.node('hardware', on_bus(host, some, last), '/late')
     probe = make_probe('/late')
@@ -288,13 +289,13 @@ def test_links_may_come_late_and_who_is_missing_is_named(suite, make_probe):
     reported('')
 
 
-# How it ends
+# End of the node
 
 @pytest.mark.parametrize(
     'number', [signal.SIGINT, signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)],
     ids=lambda number: number.name)
-def test_last_word_on_the_bus_is_no_torque(suite, make_probe, number):
-    """Links that would go on for long are let go at once."""
+def test_last_commands_before_the_end_are_without_torque(suite, make_probe, number):
+    """Links with a long command timeout coast at once."""
     bench = Bench(suite, make_probe, number.name.lower(), links_s=10.0, fresh=True)
     bench.drive()
     with open_port('fourbar_udp', bench.ear, options=f'peers={bench.host}') as ear:
@@ -317,25 +318,25 @@ def test_last_word_on_the_bus_is_no_torque(suite, make_probe, number):
 
 
 @pytest.mark.slow
-def test_links_let_go_by_themselves_when_the_host_is_killed(suite, make_probe):
+def test_links_coast_by_themselves_when_the_host_is_killed(suite, make_probe):
     bench = Bench(suite, make_probe, 'killed')
     bench.drive()
     before_ns = time.time_ns()
     bench.hardware.kill()
     killed_ns = time.time_ns()
     assert before_ns < bench.last_driven_ns() < killed_ns + COASTING_NS
-    # Once the others forget the dead one: to destroy a publisher at that very moment, as the end
-    # of the module does, locks Fast DDS up for ever.
+    # Wait until the discovery has dropped the dead node: Fast DDS deadlocks when a publisher is
+    # destroyed at that moment, as at the end of the module.
     topic = bench.probe.node.resolve_topic_name('flywheel_states')
     for each in make_probe.probes:
         each.wait(lambda node=each.node: node.count_publishers(topic) == 0, FORGOTTEN_S)
 
 
-# What happens on the bus
+# Faults on the bus
 
-def test_bus_that_drops_out_leaves_the_wheels_coasting_until_somebody_arms(bench):
+def test_wheels_coast_after_a_bus_fault_until_the_device_is_armed(bench):
     bench.drive()
-    before_ns, off_ns = bench.trouble('bus', 'off')
+    before_ns, off_ns = bench.inject('bus', 'off')
     status = bench.probe.status('device_status', state='disarmed')
     assert ': wheel_silent: ' in status['reason']
     assert before_ns < bench.last_driven_ns() < off_ns + COASTING_NS
@@ -350,9 +351,9 @@ def test_bus_that_drops_out_leaves_the_wheels_coasting_until_somebody_arms(bench
     bench.assert_nothing_moves()
     assert len(ticks) == count
 
-    bench.trouble('bus', '')
+    bench.inject('bus', '')
     bench.probe.wait(lambda: len(ticks) > count + 50)
-    # Commands come at every tick again.
+    # Commands arrive at every tick again.
     bench.assert_nothing_moves()
     assert bench.probe.status('device_status')['state'] == 'emergency_stop'
 
@@ -360,38 +361,38 @@ def test_bus_that_drops_out_leaves_the_wheels_coasting_until_somebody_arms(bench
     bench.drive()
 
 
-def test_link_that_starts_anew_while_armed_is_an_emergency_stop(bench):
+def test_restart_of_a_link_while_armed_is_an_emergency_stop(bench):
     bench.drive()
-    _, begun_ns = bench.trouble('link_b', 'reboot')
+    _, begun_ns = bench.inject('link_b', 'reboot')
     reason = 'link_b: reboot: the link has restarted while armed'
     bench.probe.status('device_status', state='emergency_stop', reason=reason)
-    told = bench.diagnostics(lambda values: values['state'] == 'emergency_stop')
-    assert told['reason'] == reason
-    assert int(told['link_b.restarts']) >= 1
-    assert told['link_a.restarts'] == '0'
+    values = bench.diagnostics(lambda values: values['state'] == 'emergency_stop')
+    assert values['reason'] == reason
+    assert int(values['link_b.restarts']) >= 1
+    assert values['link_a.restarts'] == '0'
     assert bench.last_driven_ns() < begun_ns + AT_ONCE_NS
     assert 'emergency_stop' in bench.probe.arm().message
     bench.assert_nothing_moves()
 
 
-def test_link_that_is_too_hot_ends_it_and_tells_how_hot(bench):
+def test_overtemperature_of_a_link_disarms_and_is_reported(bench):
     bench.drive()
-    _, begun_ns = bench.trouble('link_c', 'hot')
+    _, begun_ns = bench.inject('link_c', 'hot')
     reason = 'link_c: overtemperature: temperature 90 deg C, limit 80 deg C'
     bench.probe.status('device_status', state='disarmed', reason=reason)
-    told = bench.diagnostics(lambda values: values['state'] == 'disarmed')
-    assert told['reason'] == reason
-    assert told['link_c'].startswith(reason)
-    assert told['link_c.temperature_deg_c'] == '90.0'
+    values = bench.diagnostics(lambda values: values['state'] == 'disarmed')
+    assert values['reason'] == reason
+    assert values['link_c'].startswith(reason)
+    assert values['link_c.temperature_deg_c'] == '90.0'
     assert bench.last_driven_ns() < begun_ns + AT_ONCE_NS
     assert reason in bench.probe.arm().message
-    bench.trouble('link_c', '')
+    bench.inject('link_c', '')
     bench.drive()
 
 
 # The emulator
 
-def test_trouble_that_there_is_not_is_refused_with_a_list(bench):
+def test_unknown_fault_is_refused_with_the_known_ones(bench):
     accepted, reason = bench.set_parameter('trouble.link_a', 'nonsense')
     assert not accepted
     assert reason == (f'fault of link_a must be one of {", ".join(INJECTABLE_LINK_FAULTS)}, '
@@ -403,18 +404,18 @@ def test_trouble_that_there_is_not_is_refused_with_a_list(bench):
 
 
 @pytest.mark.parametrize('bad', ['trouble.link_d', 'fault.link_d'])
-def test_troubles_that_are_refused_together_are_not_made(bench, bad):
+def test_faults_set_together_are_injected_all_or_none(bench, bad):
     result = bench.probe.call(
         SetParametersAtomically, 'prototype_emulator/set_parameters_atomically',
         SetParametersAtomically.Request(parameters=[
             text_parameter('trouble.link_a', 'hot'), text_parameter(bad, 'nonsense')])).result
     assert not result.successful
     assert 'link_d' in result.reason
-    told = bench.diagnostics()
-    assert told['link_a.temperature_deg_c'] == '30.0'
+    values = bench.diagnostics()
+    assert values['link_a.temperature_deg_c'] == '30.0'
 
 
-def test_truth_comes_250_times_a_second_with_system_time(bench):
+def test_truth_is_published_at_250_hz_with_system_time(bench):
     odometry = bench.probe.follow('sim/odometry', kind=Odometry)
     bench.probe.more('sim/ledger', 3)
     bench.probe.wait(lambda: len(odometry) > 250)
@@ -422,7 +423,7 @@ def test_truth_comes_250_times_a_second_with_system_time(bench):
         messages = bench.probe.received[topic][-200:]
         steps = np.diff([stamp_of(message) for message in messages])
         assert (steps > 0).all()
-        # What a process that is held up leaves out does not count.
+        # The median ignores messages that a delayed process skips.
         assert np.median(steps) == 4_000_000
     truth = bench.probe.received['sim/link_states']
     newest = bench.probe.wait(lambda: next(
@@ -432,7 +433,7 @@ def test_truth_comes_250_times_a_second_with_system_time(bench):
 
 
 def test_truth_agrees_with_link_angles_within_their_noise(bench):
-    """In motion, so that their stamps must agree too."""
+    """The links move, so that an error of the stamps would appear too."""
     bench.drive()
     samples = bench.probe.more('link_angles', 400)
     truth = bench.probe.received['sim/link_states']
@@ -448,23 +449,23 @@ def test_truth_agrees_with_link_angles_within_their_noise(bench):
             np.array([stamp_of(message) - origin_ns for message in of_link]) * 1e-9, known,
             np.unwrap([message.position[index] for message in truth]))
         errors = np.angle(np.exp(1j * (angles - true)))
-        # A tenth of a degree, as the table of the prototype has it.
+        # Noise of a tenth of a degree, as in the table of the prototype.
         assert np.sqrt(np.mean(errors ** 2)) == pytest.approx(1.7453e-3, rel=0.35)
         assert np.abs(errors.mean()) < 5e-4
         assert np.abs(errors).max() < 6 * 1.7453e-3
 
 
-def test_emulator_says_once_that_the_linkage_met_the_edge_of_its_table(
+def test_emulator_reports_once_that_the_linkage_met_the_edge_of_the_table(
         suite, make_probe, tmp_path):
-    """Here a steep and narrow one."""
+    """The table of the test is steep and narrow, so that the linkage slides to its edge."""
     text = (share_directory() / 'config' / 'table_prototype.yaml').read_text()
     lines = [f'  {name}: {values[name]}' if (name := line.split(':')[0].strip()) in (
         values := {'tilt_x': 0.002, 'size_x': 0.47}) else line for line in text.splitlines()]
     table = tmp_path / 'steep.yaml'
     table.write_text('\n'.join(lines))
-    here, nobody = free_channels(2)
+    own, unused = free_channels(2)
     emulator = suite.node(
-        'prototype_emulator', {**on_bus(here, nobody), 'table': str(table)}, '/edge')
+        'prototype_emulator', {**on_bus(own, unused), 'table': str(table)}, '/edge')
     probe = make_probe('/edge')
     probe.follow('sim/link_states')
     probe.wait(lambda: 'met the edge of the table' in emulator.stderr)

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Every tick is answered, though there is no estimate, and though the answer was lost."""
+"""Lock-step without an estimate, and with lost answers: every tick is answered in the end."""
 
 import pytest
 from sensor_msgs.msg import JointState
@@ -13,7 +13,7 @@ FIRST_NS = 1_000_000_000
 PERIOD_NS = 4_000_000
 LINKS = [f'link_{letter}' for letter in 'abcd']
 WHEELS = [f'flywheel_{letter}' for letter in 'abcd']
-# Of the square that starts as the paper's linkage does.
+# Initial link angles of the square, the same as of the linkage of the paper [rad].
 ANGLES = [0.0, 1.047197551197, 0.0, 1.047197551197]
 
 
@@ -30,7 +30,7 @@ def stamp_of(message):
 
 @pytest.fixture(scope='module')
 def plant(module_suite, make_probe):
-    """Run a plant in lock-step; the probe is its estimator and controller, and silent."""
+    """Run a plant in lock-step; the probe replaces estimator and controller, and sends nothing."""
     module_suite.node('plant', {'clock': 'lockstep', 'guard_timeout': 0.3}, '/plant_alone')
     testbed = make_probe('/plant_alone')
     testbed.follow('flywheel_states', 'link_angles')
@@ -41,7 +41,7 @@ def plant(module_suite, make_probe):
     return testbed
 
 
-def test_tick_without_an_answer_comes_again_as_it_was(plant):
+def test_tick_without_an_answer_is_repeated_unchanged(plant):
     ticks, angles = plant.received['flywheel_states'], plant.received['link_angles']
     plant.wait(lambda: len(ticks) >= 3 and len(angles) >= 3)
     assert stamp_of(ticks[0]) == FIRST_NS
@@ -49,7 +49,7 @@ def test_tick_without_an_answer_comes_again_as_it_was(plant):
         assert all(message == messages[0] for message in messages)
 
 
-def test_word_that_there_is_no_estimate_answers_a_tick(plant):
+def test_message_that_there_is_no_estimate_answers_a_tick(plant):
     ticks = plant.received['flywheel_states']
     for _ in range(20):
         stamp_ns = stamp_of(ticks[-1])
@@ -58,21 +58,21 @@ def test_word_that_there_is_no_estimate_answers_a_tick(plant):
         assert stamp_of(ticks[-1]) == stamp_ns + PERIOD_NS
 
 
-def test_word_about_another_tick_answers_nothing(plant):
+def test_message_about_another_tick_answers_nothing(plant):
     ticks = plant.received['flywheel_states']
     plant.catch_up()
     pending_ns = stamp_of(ticks[-1])
     for stamp_ns in (0, pending_ns - PERIOD_NS, pending_ns + PERIOD_NS):
         plant.waiting.publish(at(stamp_ns, Header()))
     begin = len(ticks)
-    # It comes again, and no other does.
+    # The plant repeats the pending tick and makes no other one.
     plant.wait(lambda: len(ticks) > begin)
     assert stamp_of(ticks[-1]) == pending_ns
 
 
 @pytest.fixture(scope='module')
 def estimator(module_suite, make_probe):
-    """Run an estimator whose plant is the probe."""
+    """Run an estimator; the probe replaces its plant."""
     module_suite.node('estimator', {'use_sim_time': True}, '/estimator_alone')
     testbed = make_probe('/estimator_alone')
     testbed.follow('estimate/waiting', kind=Header)
@@ -89,7 +89,7 @@ def tick(stamp_ns, speeds=(0.0, 0.0, 0.0, 0.0)):
                                    effort=[0.0] * 4))
 
 
-def test_estimator_says_of_every_tick_whether_it_has_an_estimate(estimator):
+def test_estimator_reports_at_every_tick_whether_it_has_an_estimate(estimator):
     waiting = estimator.received['estimate/waiting']
     estimates = estimator.received['estimate/link_states']
     estimator.ticks.publish(tick(FIRST_NS))
@@ -98,14 +98,14 @@ def test_estimator_says_of_every_tick_whether_it_has_an_estimate(estimator):
         at(FIRST_NS + PERIOD_NS, JointState(name=LINKS, position=ANGLES)))
     estimator.ticks.publish(tick(FIRST_NS + PERIOD_NS))
     estimator.wait(lambda: estimates)
-    # Older than the last: the plant was started again, a short while after the first start.
+    # The tick is older than the last one, as after a restart of the plant.
     estimator.ticks.publish(tick(FIRST_NS))
     estimator.wait(lambda: len(waiting) == 2)
     assert [stamp_of(message) for message in waiting] == [FIRST_NS, FIRST_NS]
     assert [stamp_of(message) for message in estimates] == [FIRST_NS + PERIOD_NS]
 
 
-def test_estimator_answers_a_repeated_tick_as_before(estimator):
+def test_estimator_answers_a_repeated_tick_with_the_same_messages(estimator):
     for n in (2, 3):
         estimator.angles.publish(at(FIRST_NS + n * PERIOD_NS, JointState(
             name=LINKS, position=[angle + 1e-3 * n for angle in ANGLES])))

@@ -24,8 +24,8 @@ NODES = {
 }
 # Ticks before arming, between arming and setpoint, and after the setpoint, as in the baseline.
 BEFORE, BETWEEN, AFTER = 40, 10, 1300
+# Relative tolerance for a changed order of arithmetic.
 TOLERANCE = 1e-9
-"""Relative tolerance for a changed order of arithmetic."""
 
 
 @pytest.fixture(scope='module')
@@ -38,7 +38,7 @@ def bag(module_suite, make_probe, tmp_path_factory):
     recorder = module_suite.start('record', '-o', str(bag))
     probe.follow('controller_status')
     publisher = probe.publisher(JointState, 'setpoint')
-    # Controller and recorder take the setpoint.
+    # Controller and recorder subscribe to the setpoint.
     probe.wait(lambda: publisher.get_subscription_count() >= 2)
     client = probe.node.create_client(Trigger, 'sim/step')
     probe.wait(client.service_is_ready)
@@ -54,7 +54,7 @@ def bag(module_suite, make_probe, tmp_path_factory):
     step(BEFORE)
     probe.wait(lambda: probe.arm().success)
     step(BETWEEN)
-    probe.setpoint_verdict(
+    probe.setpoint_decision(
         JointState(name=['link_a', 'link_b'], position=[0.3, 1.5]), publisher)
     step(AFTER)
     recorder.end(signal.SIGINT)
@@ -62,7 +62,7 @@ def bag(module_suite, make_probe, tmp_path_factory):
 
 
 def flat(document, place=''):
-    """Return the leaves of a JSON document by their place."""
+    """Return the leaves of a JSON document by their path."""
     if isinstance(document, dict):
         return {key: value for name, entry in document.items()
                 for key, value in flat(entry, f'{place}.{name}').items()}
@@ -84,7 +84,7 @@ def test_metrics_are_those_of_the_first_edition(bag, tmp_path):
 
 
 def test_topics_are_those_of_the_first_edition(bag):
-    """Names, types, serialization and the offered durability and reliability of a demo."""
+    """Compare names, types, serialization, and the offered durability and reliability."""
     with Reader(bag) as reader:
         found = {connection.topic: connection for connection in reader.connections}
     for expected in json.loads((BASELINE / 'demo_connections.json').read_text()):

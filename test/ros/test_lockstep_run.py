@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 
 pytestmark = pytest.mark.node
 
-# Ticks before the device is armed, between that and the setpoint, and after it.
+# Ticks before arming, between arming and setpoint, and after the setpoint.
 BEFORE, BETWEEN, AFTER = 40, 10, 300
 COMMANDS = {'paper': 'effort', 'prototype': 'velocity'}
 GOAL = {'link_a': 0.3, 'link_b': 1.5}
@@ -32,7 +32,7 @@ def stamp_of(message):
 
 
 def without_ros(scenario):
-    """Run the same script in one process: arrays by topic and field."""
+    """Run the sequence in one process; return arrays by topic and field."""
     loop = make_loop(scenario)
     recording = RunRecord(scenario.table.link_sensors.sensor_names)
     for tick in range(BEFORE + BETWEEN + AFTER):
@@ -45,7 +45,7 @@ def without_ros(scenario):
 
 
 def over_topics(scenario, suite, probe, namespace):
-    """Run it with three nodes, paused while a person acts: messages by topic."""
+    """Run the sequence with three nodes, paused at each request; return messages by topic."""
     parameters = scenario.parameters()
     for name in ('plant', 'estimator', 'controller'):
         extra = {'clock': 'lockstep', 'start_paused': True} if name == 'plant' else {}
@@ -58,7 +58,7 @@ def over_topics(scenario, suite, probe, namespace):
     probe.wait(client.service_is_ready)
 
     def stepped():
-        """Ask for a tick; refused while the last one has no answer yet."""
+        """Request a tick; the plant refuses it until the last one is answered."""
         future = client.call_async(Trigger.Request())
         probe.wait(future.done)
         return future.result().success
@@ -71,33 +71,33 @@ def over_topics(scenario, suite, probe, namespace):
     probe.status('device_status', state='armed')
     step(BETWEEN)
     probe.status('controller_status', mode='hold')
-    probe.setpoint_verdict(
+    probe.setpoint_decision(
         JointState(name=list(GOAL), position=list(GOAL.values())), publisher)
     last_ns = stamp_of(ticks[-1]) + AFTER * scenario.plant.period_ns
-    # Tick by tick to the end: left to itself it is faster than a subscriber who is held up.
+    # Step to the end: a running plant may be faster than a delayed subscriber.
     step(AFTER + 5)
     probe.catch_up()
-    # A tick that waited for long comes again as it was, and so do answers to it.
+    # The plant repeats an unanswered tick unchanged, and so do the answers.
     return {topic: list({stamp_of(message): message for message in probe.received[topic]
                          if stamp_of(message) <= last_ns}.values()) for topic in TOPICS}
 
 
 @pytest.mark.parametrize('preset', ['paper', 'prototype'])
 def test_every_sample_is_the_same(suite, make_probe, preset):
-    """To the last bit, with noise, latency and dropout, whatever the machine does meanwhile."""
+    """All bits agree, with noise, latency and dropout, under any load of the machine."""
     scenario = replace(load_scenario(preset), seed=11)
     expected = without_ros(scenario)
     found = over_topics(scenario, suite, make_probe(f'/{preset}'), f'/{preset}')
     for topic, fields in TOPICS.items():
         stamps = expected[f'{topic}.stamp_ns']
         if topic == 'link_angles':
-            # The last samples of the run arrive with ticks after it.
+            # The last samples of the run arrive with later ticks.
             del found[topic][len(stamps):]
         assert [stamp_of(message) for message in found[topic]] == stamps.tolist(), topic
         for field in fields:
             for row, message in zip(expected[f'{topic}.{field}'], found[topic]):
                 given = row[~np.isnan(row)]
                 assert given.tolist() == list(getattr(message, field)), (topic, field)
-    # The presets differ in what they tell the wheels.
+    # One preset commands efforts, the other one speeds.
     assert np.nanmax(np.abs(expected[f'flywheel_command.{COMMANDS[preset]}'])) > 0.0
     assert bool(found['flywheel_command'][-1].velocity) == (preset == 'prototype')

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A namespace moves everything but /diagnostics, and keeps two testbeds apart."""
+"""A namespace contains all names but /diagnostics, and separates two testbeds."""
 
 import pytest
 from sensor_msgs.msg import JointState
@@ -13,11 +13,11 @@ GLOBAL = {'/diagnostics', '/rosout', '/parameter_events'}
 
 @pytest.fixture(scope='module')
 def labs(module_suite, make_probe):
-    """Two testbeds beside each other, and a probe in each."""
+    """Return two testbeds in namespaces, with a probe in each."""
     probes = {}
     for name, angle in (('lab', 0.0), ('other', 1.0)):
         module_suite.nodes(
-            # Two loops at full rate are more than two cores can do.
+            # Two cores are too slow for two loops at full rate.
             f'/{name}', plant={'rate': 100.0, 'initial.link_a': angle,
                                'initial.link_b': angle + 1.0},
             controller={'setpoint_duration': 1.0})
@@ -42,15 +42,15 @@ def test_status_on_the_common_diagnostics_names_its_node(labs):
         assert labs['lab'].diagnostics(name).name == name
 
 
-def test_loop_closes_in_a_namespace_and_leaves_the_other_alone(labs):
+def test_loop_in_a_namespace_has_no_effect_on_the_other_one(labs):
     lab, other = labs['lab'], labs['other']
     before = other.status('controller_status')
     assert lab.arm().success
     lab.status('controller_status', mode='hold')
-    verdict = lab.setpoint_verdict(
+    decision = lab.setpoint_decision(
         JointState(name=['link_a', 'link_b'], position=[0.1, 1.1]),
         lab.publisher(JointState, 'setpoint'))
-    assert verdict['mode'] == 'track'
+    assert decision['mode'] == 'track'
     lab.status('controller_status', mode='hold')
     lab.wait(lambda: lab.received['sim/link_states'][-1].position[0] == pytest.approx(
         0.1, abs=0.02))

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameters: declared as the tables say, checked at start and at run time."""
+"""Parameters: declared as in the tables, checked at start and at run time."""
 
 import os
 
@@ -23,17 +23,17 @@ pytestmark = pytest.mark.node
 FIELDS = {float: 'double_value', int: 'integer_value', str: 'string_value', bool: 'bool_value'}
 TYPES = {float: ParameterType.PARAMETER_DOUBLE, int: ParameterType.PARAMETER_INTEGER,
          str: ParameterType.PARAMETER_STRING, bool: ParameterType.PARAMETER_BOOL}
-# What every node of rclpy declares.
+# Parameters of every node of rclpy.
 OF_ROS = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 
-# These need a bus, and have topics that others have: so they are in a namespace of their own.
+# Nodes that need a bus; they share topics with other nodes, so they have their own namespace.
 BUS_NODES, BENCH = ('hardware', 'prototype_emulator'), '/bench'
 BUS = ('bus.interface', 'bus.channel', 'bus.options')
 
 ROWS = [(node, row) for node, table in TABLES.items() for row in table]
 each_node = pytest.mark.parametrize('node', list(TABLES))
 
-# By node: a refused argument, and a name or value in the one line of the message.
+# Node, refused argument, and a name or value in the error message.
 BAD_AT_START = [
     ('plant', ['-p', 'rate:=nan'], 'rate'),
     ('plant', ['-p', 'rate:=0.0'], '2000'),
@@ -57,40 +57,40 @@ BAD_AT_START = [
 
 
 def value_in(value):
-    """Return what is in a ParameterValue."""
+    """Return the value of a ParameterValue."""
     return next(getattr(value, field) for kind, field in FIELDS.items()
                 if TYPES[kind] == value.type)
 
 
 def given(value):
-    """Make a ParameterValue."""
+    """Return the ParameterValue of a value."""
     message = ParameterValue(type=TYPES[type(value)])
     setattr(message, FIELDS[type(value)], value)
     return message
 
 
 def values_in(probe, node, names):
-    """Ask a node for parameters."""
+    """Return the values of parameters of a node."""
     values = probe.call(
         GetParameters, f'{node}/get_parameters', GetParameters.Request(names=names)).values
     return {name: value_in(value) for name, value in zip(names, values)}
 
 
 def set_value(probe, node, name, value):
-    """Set a parameter: whether it was accepted, and the reason."""
+    """Set a parameter; return whether it was accepted, and the reason."""
     result, = probe.call(SetParameters, f'{node}/set_parameters', SetParameters.Request(
         parameters=[Parameter(name=name, value=given(value))])).results
     return result.successful, result.reason
 
 
 def full_name(node):
-    """Return where a node of the testbed is."""
+    """Return the full name of a node of the testbed."""
     return f'{BENCH}/{node}' if node in BUS_NODES else node
 
 
 @pytest.fixture(scope='module')
 def testbed(module_suite, probe):
-    """Start the nodes with nothing but their defaults, and a bus where they need one."""
+    """Start the nodes with their defaults, and with a bus where they need one."""
     for node in TABLES:
         if node not in BUS_NODES:
             module_suite.start(node)
@@ -104,7 +104,7 @@ def testbed(module_suite, probe):
 
 
 @each_node
-def test_node_declares_just_its_table(testbed, node):
+def test_node_declares_exactly_its_table(testbed, node):
     service = f'{full_name(node)}/list_parameters'
     names = testbed.call(ListParameters, service, ListParameters.Request()).result.names
     assert sorted(name for name in names if not name.startswith(OF_ROS)) == sorted(
@@ -161,7 +161,7 @@ def test_choices_are_described(testbed):
 @pytest.mark.parametrize(
     ('node', 'row'), [(node, row) for node, row in ROWS if not row.live],
     ids=[f'{node}-{row.name}' for node, row in ROWS if not row.live])
-def test_parameter_that_is_read_at_start_cannot_be_set_later(testbed, node, row):
+def test_read_only_parameter_cannot_be_set_at_run_time(testbed, node, row):
     other = row.default + '2' if isinstance(row.default, str) else row.default + type(
         row.default)(1)
     before = values_in(testbed, full_name(node), [row.name])
@@ -176,13 +176,13 @@ def test_bad_value_is_refused_at_run_time(testbed, value):
     before = values_in(testbed, 'controller', ['bandwidth'])
     accepted, reason = set_value(testbed, 'controller', 'bandwidth', value)
     assert not accepted
-    # The message of the package and not that of rclpy, which names no unit.
+    # The message is that of the package; the message of rclpy names no unit.
     assert 'bandwidth' in reason
     assert type(value) is not float or 'rad/s' in reason
     assert values_in(testbed, 'controller', ['bandwidth']) == before
 
 
-def test_set_together_all_or_none(testbed):
+def test_parameters_set_together_change_all_or_none(testbed):
     before = values_in(testbed, 'controller', ['bandwidth', 'damping'])
     result = testbed.call(
         SetParametersAtomically, 'controller/set_parameters_atomically',
@@ -193,7 +193,7 @@ def test_set_together_all_or_none(testbed):
     assert values_in(testbed, 'controller', ['bandwidth', 'damping']) == before
 
 
-def test_whole_number_is_taken_for_a_float(testbed):
+def test_integer_is_accepted_for_a_float(testbed):
     assert set_value(testbed, 'controller', 'damping', 1) == (True, '')
     assert set_value(testbed, 'controller', 'damping', 0.9) == (True, '')
 
@@ -206,10 +206,10 @@ def test_setpoint_duration_acts_at_once(testbed):
 
 def test_bandwidth_acts_at_once(testbed):
     """
-    At the same errors the wheels get torque in proportion to the law's gains.
+    The wheel torque per tracking error changes with the gains of the law.
 
-    At rest the law is `torque ~ w^2 angle_error + 2 d w rate_error`: the torque that the errors
-    explain best tells w. What is estimated of disturbances would come on top of it.
+    At rest the law is `torque ~ w^2 angle_error + 2 d w rate_error`: a regression of the torque
+    on the errors gives w. The compensation of disturbances is off, because it adds to the torque.
     """
     assert set_value(testbed, 'controller', 'disturbance_compensation', 0.0) == (True, '')
     testbed.wait(lambda: testbed.arm().success)
@@ -228,7 +228,7 @@ def test_bandwidth_acts_at_once(testbed):
         assert set_value(testbed, 'controller', 'bandwidth', bandwidth) == (True, '')
         testbed.more('tracking_error', 20)
         stiffness, damping = found()
-        # Half of the pair's inertia, against the link.
+        # Each wheel of a pair takes half of the inertia; its torque opposes that on the link.
         assert stiffness == pytest.approx(-1.44e-4 / 2 * bandwidth ** 2, rel=0.02)
         assert damping == pytest.approx(-1.44e-4 / 2 * 2 * 0.9 * bandwidth, rel=0.02)
     testbed.arm(False)
@@ -240,7 +240,7 @@ def test_shipped_file_holds_the_tables():
 
 
 def test_shipped_file_works_in_a_namespace(suite, make_probe):
-    """All nodes without a bus start with it; and a copy with other values reaches them there."""
+    """All nodes without a bus start with the file, and take other values from a changed copy."""
     path = share_directory() / 'config' / 'nodes.yaml'
     text = path.read_text()
     changed = {'rate: 250.0': 'rate: 125', 'angle_noise: 0.0017453': 'angle_noise: 0.002',
@@ -270,8 +270,8 @@ def test_shipped_file_works_in_a_namespace(suite, make_probe):
 
 
 @pytest.mark.parametrize('priority', [0, 1])
-def test_realtime_priority_is_only_that_which_was_asked_for(suite, make_probe, priority):
-    """And a node that may not have it says so and runs."""
+def test_realtime_priority_is_that_of_the_parameter(suite, make_probe, priority):
+    """A node without the permission for the priority reports this and runs."""
     namespace = f'/priority_{priority}'
     process = suite.node('estimator', {'realtime_priority': priority}, namespace)
     make_probe(namespace).diagnostics(f'{namespace[1:]}/estimator')
@@ -286,7 +286,7 @@ def test_realtime_priority_is_only_that_which_was_asked_for(suite, make_probe, p
 
 @pytest.fixture(scope='module')
 def refused(module_suite):
-    """Start nodes with bad values, all at once, and wait for their ends."""
+    """Start nodes with bad values in parallel, and wait until they end."""
     processes = [module_suite.start(node, '--ros-args', *arguments)
                  for node, arguments, _ in BAD_AT_START]
     for process in processes:
@@ -299,7 +299,7 @@ def refused(module_suite):
 def test_bad_value_at_start_ends_the_node_with_one_line(refused, index):
     process, (node, _, word) = refused[index], BAD_AT_START[index]
     assert process.popen.returncode == 2, process.stderr
-    # rcl itself may say more when it cannot read its arguments.
+    # rcl prints further lines when it cannot parse its arguments.
     line, = [line for line in process.stderr.splitlines() if '[rcl]' not in line]
     assert line.startswith(f'fourbar {node}: ')
     assert word in line

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The recorder over real DDS: what is published is in the bag, whatever happens."""
+"""The recorder over DDS: the bag contains all published messages."""
 
 import os
 import signal
@@ -38,7 +38,7 @@ def node(domain):
 
 
 class Record:
-    """`fourbar record`, which writes beside the files for what it prints."""
+    """A process of `fourbar record`, with files of its stdout and stderr."""
 
     def __init__(self, start, printed):
         self._out, self._err = printed / 'stdout', printed / 'stderr'
@@ -51,7 +51,7 @@ class Record:
         return self._out.read_text()
 
     def end(self, number=None):
-        """Return exit code, stdout and stderr, after a signal if one is given."""
+        """Send a signal if one is given; return exit code, stdout and stderr."""
         if number is not None:
             self.popen.send_signal(number)
         return self.popen.wait(3 * DEADLINE_S), self.stdout, self._err.read_text()
@@ -60,9 +60,9 @@ class Record:
 @pytest.fixture
 def record(domain, fork_server, tmp_path, tmp_path_factory):
     """
-    Return a function that starts `fourbar record`; what is left of it ends with the test.
+    Return a function that starts `fourbar record`; running processes end with the test.
 
-    In an interpreter that has imported nothing if it is to be `fresh`.
+    The argument `fresh` starts it in a new interpreter.
     """
     started = []
 
@@ -94,13 +94,13 @@ def publish(load_clock):
         for number in range(count):
             publisher.publish(JointState(name=['number'], position=[float(number)]))
             time.sleep(0.0005)
-        # The messages are still in shared memory; their acknowledgement takes seconds.
+        # The messages are in shared memory; to wait for their acknowledgement would take seconds.
         load_clock.sleep(0.2)
     return publish
 
 
 def numbers(bag, topic):
-    """Return the numbers that were recorded on a topic, in order."""
+    """Return the recorded numbers of a topic, in order."""
     store = get_typestore(Stores.ROS2_JAZZY)
     with Reader(bag) as reader:
         connections = [c for c in reader.connections if c.topic == topic]
@@ -203,7 +203,7 @@ def test_type_that_cannot_be_imported_is_named_once_and_the_rest_recorded(
     assert numbers(tmp_path / 'bag', '/one') == list(range(500))
 
 
-def test_nothing_received_still_makes_a_bag(record, tmp_path, load_clock):
+def test_recording_without_messages_makes_a_bag(record, tmp_path, load_clock):
     process = record('-o', 'bag')
     load_clock.wait(lambda: process.stdout.startswith('recording to bag\n'))
 
@@ -219,7 +219,7 @@ def test_nothing_received_still_makes_a_bag(record, tmp_path, load_clock):
     (['-o', 'bag', 'no topic!'], {}, 'topic'),
     (['-o', 'bag'], {'ROS_DOMAIN_ID': '999'}, 'ROS_DOMAIN_ID'),
 ])
-def test_bad_input_is_one_line_and_leaves_nothing(record, tmp_path, arguments, environment,
+def test_bad_input_is_one_line_and_leaves_no_file(record, tmp_path, arguments, environment,
                                                   complaint):
     (tmp_path / 'taken').mkdir()
     (tmp_path / 'file').touch()

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Setpoints over DDS: as typed on a command line, accepted or refused with the reason."""
+"""Setpoints over DDS: from the command line, accepted, or refused with the reason."""
 
 from math import inf, nan
 
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.node
 
 LINKS = ['link_a', 'link_b', 'link_c', 'link_d']
 DURATION_S = 2.0
-# What `ros2 topic pub` offers, in this and in earlier distributions.
+# Quality of service of `ros2 topic pub`, in this and in earlier distributions.
 OF_TOPIC_PUB = {
     'volatile': QoSProfile(depth=10),
     'latched': QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
@@ -54,10 +54,10 @@ def started(nodes, probe):
 
 @pytest.fixture
 def testbed(started):
-    """Arm; the controller holds, and takes the place where it is for its goal."""
+    """Arm; the controller holds the present angles."""
     started.wait(lambda: started.arm().success)
     started.status('controller_status', mode='hold')
-    # What was under way before that follows the noisy estimate.
+    # Earlier messages follow the noisy estimate.
     held = started.received['reference']
     started.wait(lambda: len(held) > 1 and held[-1].position == held[-2].position)
     yield started
@@ -70,18 +70,18 @@ def goal_of(status):
 
 
 def reference(testbed):
-    """Return where the links are told to be now."""
+    """Return the present reference [rad]."""
     return np.array(testbed.more('reference')[0].position)
 
 
 @pytest.mark.parametrize('quality', list(OF_TOPIC_PUB))
 def test_setpoint_from_the_command_line_is_reached(testbed, quality):
-    """`ros2 topic pub --once /setpoint ...` of the README, word by word."""
+    """The message is that of `ros2 topic pub --once /setpoint ...` in the README."""
     publisher = testbed.publisher(JointState, 'setpoint', OF_TOPIC_PUB[quality])
-    verdict = testbed.setpoint_verdict(
+    decision = testbed.setpoint_decision(
         JointState(name=['link_a', 'link_b'], position=[0.0, 1.57]), publisher)
-    assert verdict['mode'] == 'track'
-    assert goal_of(verdict)[:2] == pytest.approx([0.0, 1.57], abs=1e-6)
+    assert decision['mode'] == 'track'
+    assert goal_of(decision)[:2] == pytest.approx([0.0, 1.57], abs=1e-6)
 
     testbed.status('controller_status', mode='hold')
 
@@ -89,10 +89,10 @@ def test_setpoint_from_the_command_line_is_reached(testbed, quality):
     testbed.node.destroy_publisher(publisher)
 
 
-def test_reference_goes_from_where_it_is_to_the_goal_in_the_set_time(testbed, publisher):
+def test_reference_reaches_the_goal_in_the_setpoint_duration(testbed, publisher):
     begin = reference(testbed)
     count = len(testbed.received['reference'])
-    testbed.setpoint_verdict(JointState(name=['link_a'], position=[0.2]), publisher)
+    testbed.setpoint_decision(JointState(name=['link_a'], position=[0.2]), publisher)
     testbed.status('controller_status', mode='hold')
     testbed.more('reference', 5)
     moved = [message for message in testbed.received['reference'][count:]
@@ -106,11 +106,11 @@ def test_reference_goes_from_where_it_is_to_the_goal_in_the_set_time(testbed, pu
 
 
 def test_link_that_is_not_named_holds(testbed, publisher):
-    """Link a alone moves: its partner b stays where it was told to be, to the last bit."""
+    """Link a alone moves; the reference of link b stays the same in all bits."""
     before = reference(testbed)
-    verdict = testbed.setpoint_verdict(
+    decision = testbed.setpoint_decision(
         JointState(name=['link_a'], position=[before[0] + 0.1]), publisher)
-    assert goal_of(verdict)[1] == pytest.approx(before[1], abs=1e-6)
+    assert goal_of(decision)[1] == pytest.approx(before[1], abs=1e-6)
     testbed.status('controller_status', mode='hold')
     after = reference(testbed)
     assert after[0] == pytest.approx(before[0] + 0.1, abs=1e-9)
@@ -118,17 +118,17 @@ def test_link_that_is_not_named_holds(testbed, publisher):
 
 
 @pytest.mark.parametrize('case', list(WRONG))
-def test_wrong_setpoint_is_refused_whole(testbed, publisher, case):
+def test_wrong_setpoint_is_refused_as_a_whole(testbed, publisher, case):
     (names, positions), word = WRONG[case]
     before = testbed.status('controller_status')
     present = reference(testbed)
 
-    verdict = testbed.setpoint_verdict(JointState(name=names, position=positions), publisher)
+    decision = testbed.setpoint_decision(JointState(name=names, position=positions), publisher)
 
-    assert verdict['accepted'] == before['accepted']
-    assert int(verdict['refused']) == int(before['refused']) + 1
-    assert word in verdict['last_refusal']
-    assert (verdict['mode'], verdict['goal']) == ('hold', before['goal'])
+    assert decision['accepted'] == before['accepted']
+    assert int(decision['refused']) == int(before['refused']) + 1
+    assert word in decision['last_refusal']
+    assert (decision['mode'], decision['goal']) == ('hold', before['goal'])
     assert (reference(testbed) == present).all()
 
 
@@ -138,36 +138,36 @@ def test_stale_setpoint_is_refused(testbed, publisher, age_s):
     message = JointState(name=['link_a'], position=[0.3])
     stamp_ns = testbed.node.get_clock().now().nanoseconds - round(age_s * 1e9)
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
-    verdict = testbed.setpoint_verdict(message, publisher)
-    assert 'stamp' in verdict['last_refusal']
-    assert verdict['mode'] == 'hold'
+    decision = testbed.setpoint_decision(message, publisher)
+    assert 'stamp' in decision['last_refusal']
+    assert decision['mode'] == 'hold'
     assert (reference(testbed) == present).all()
 
 
-def test_setpoint_with_the_stamp_of_the_last_tick_is_taken(testbed, publisher):
+def test_setpoint_with_the_stamp_of_the_last_tick_is_accepted(testbed, publisher):
     message = JointState(name=['link_a'], position=[0.05])
     message.header.stamp = testbed.more('flywheel_states')[0].header.stamp
-    verdict = testbed.setpoint_verdict(message, publisher)
-    assert verdict['mode'] == 'track'
+    decision = testbed.setpoint_decision(message, publisher)
+    assert decision['mode'] == 'track'
 
 
-def test_refused_setpoint_leaves_the_move_under_way_alone(testbed, publisher):
+def test_refused_setpoint_does_not_change_the_present_move(testbed, publisher):
     begin = reference(testbed)
-    goal = testbed.setpoint_verdict(
+    goal = testbed.setpoint_decision(
         JointState(name=['link_a'], position=[begin[0] - 0.2]), publisher)['goal']
-    refused = testbed.setpoint_verdict(JointState(name=['link_a'], position=[nan]), publisher)
+    refused = testbed.setpoint_decision(JointState(name=['link_a'], position=[nan]), publisher)
     assert (refused['mode'], refused['goal']) == ('track', goal)
     testbed.status('controller_status', mode='hold')
     assert reference(testbed)[0] == pytest.approx(begin[0] - 0.2, abs=1e-9)
 
 
 def test_goal_is_dropped_when_disarmed(testbed, publisher):
-    testbed.setpoint_verdict(JointState(name=['link_a'], position=[0.3]), publisher)
+    testbed.setpoint_decision(JointState(name=['link_a'], position=[0.3]), publisher)
 
     testbed.arm(False)
 
     assert testbed.status('controller_status', mode='disarmed')['goal'] == ''
-    # Reference = present estimate, whatever the links do.
+    # While disarmed the reference is the present estimate.
     testbed.more('reference', 20)
     estimates = {(message.header.stamp.sec, message.header.stamp.nanosec): message.position
                  for message in testbed.received['estimate/link_states'][-200:]}
@@ -176,7 +176,7 @@ def test_goal_is_dropped_when_disarmed(testbed, publisher):
         if stamp in estimates:
             assert message.position == estimates[stamp]
             assert not any(message.velocity)
-    # Armed again it stays: the old goal does not come back.
+    # After arming the controller holds and does not resume the old goal.
     testbed.arm()
     held = testbed.status('controller_status', mode='hold')
     assert held['goal'] == ''
@@ -188,20 +188,20 @@ def test_goal_is_dropped_when_disarmed(testbed, publisher):
 def test_setpoint_while_disarmed_is_refused_and_not_kept(started, publisher):
     started.arm(False)
     before = started.status('controller_status', mode='disarmed')
-    verdict = started.setpoint_verdict(
+    decision = started.setpoint_decision(
         JointState(name=['link_a'], position=[0.5]), publisher)
-    assert int(verdict['refused']) == int(before['refused']) + 1
-    assert 'not armed' in verdict['last_refusal']
-    assert (verdict['mode'], verdict['goal']) == ('disarmed', '')
+    assert int(decision['refused']) == int(before['refused']) + 1
+    assert 'not armed' in decision['last_refusal']
+    assert (decision['mode'], decision['goal']) == ('disarmed', '')
     assert not any(any(message.effort) for message in started.more('flywheel_command', 50))
     started.arm()
     assert started.status('controller_status', mode='hold')['goal'] == ''
 
 
 def test_refusals_are_counted_on_diagnostics_too(started, publisher):
-    verdict = started.setpoint_verdict(
+    decision = started.setpoint_decision(
         JointState(name=['link_x'], position=[0.5]), publisher)
-    wanted = {key: verdict[key] for key in ('refused', 'last_refusal')}
+    wanted = {key: decision[key] for key in ('refused', 'last_refusal')}
     status = started.diagnostics('controller', lambda status: {
         'setpoints_refused': wanted['refused'], 'last_refusal': wanted['last_refusal'],
     }.items() <= {item.key: item.value for item in status.values}.items())

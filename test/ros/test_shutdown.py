@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Every node ends when it is asked to: quickly, silently, and with the wheels let go."""
+"""End of the nodes by signals: in time, without errors, and with coasting wheels."""
 
 from functools import partial
 from itertools import product
@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 
 pytestmark = pytest.mark.node
 
-# Two seconds, and what a busy machine takes.
+# Time limit for the end of a node: two seconds, and a margin for a busy machine [s].
 SHUTDOWN_S = 2.0 + 3.0
 SIGNALS = pytest.mark.parametrize(
     'number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
@@ -23,7 +23,7 @@ SIGNALS = pytest.mark.parametrize(
 
 @SIGNALS
 def test_moving_testbed_ends_cleanly(suite, make_probe, number):
-    """Controller, estimator, plant, in the middle of a move."""
+    """Controller, estimator and plant end in this order, in the middle of a move."""
     namespace = f'/{number.name.lower()}'
     nodes = suite.nodes(namespace, fresh=True)
     probe = make_probe(namespace)
@@ -31,13 +31,13 @@ def test_moving_testbed_ends_cleanly(suite, make_probe, number):
     probe.newest('flywheel_command')
     probe.wait(lambda: probe.arm().success)
     probe.status('controller_status', mode='hold')
-    probe.setpoint_verdict(JointState(name=['link_a'], position=[0.5]),
+    probe.setpoint_decision(JointState(name=['link_a'], position=[0.5]),
                            probe.publisher(JointState, 'setpoint'))
     probe.wait(lambda: any(probe.received['flywheel_command'][-1].effort))
 
     assert nodes['controller'].end(number, SHUTDOWN_S) == 0
     nodes['controller'].check_clean()
-    # What it said last: no torque.
+    # The last command is without torque.
     probe.wait(lambda: not any(probe.received['flywheel_command'][-1].effort))
     count = len(probe.received['flywheel_command'])
     status = probe.status('device_status', state='disarmed')
@@ -55,7 +55,7 @@ def test_moving_testbed_ends_cleanly(suite, make_probe, number):
 
 @pytest.fixture(scope='module')
 def alone(module_suite):
-    """Start nodes at once, each in a namespace of its own."""
+    """Start nodes in parallel, each in its own namespace."""
     return {namespace: module_suite.node(name, namespace=f'/{namespace}', fresh=True)
             for namespace, name in (
                 ('alone_plant', 'plant'), ('alone_estimator', 'estimator'),
@@ -63,8 +63,8 @@ def alone(module_suite):
 
 
 @pytest.mark.parametrize('name', ['plant', 'estimator', 'controller'])
-def test_node_alone_ends_as_soon_as_it_is_asked_to(alone, make_probe, name):
-    """Without anybody to talk to there is nothing to wait for."""
+def test_node_without_other_nodes_ends_in_time(alone, make_probe, name):
+    """A node without publishers and subscribers waits for none of them."""
     process = alone[f'alone_{name}']
     probe = make_probe(f'/alone_{name}')
     probe.diagnostics(f'alone_{name}/{name}')
@@ -82,8 +82,8 @@ def test_second_signal_does_no_harm(alone, make_probe):
     process.check_clean()
 
 
-def test_signal_during_the_start_is_no_outcry(suite, make_probe):
-    """It ends, whether or not it was ready, and never with a traceback of ours."""
+def test_signal_during_the_start_prints_no_error(suite, make_probe):
+    """The node ends without a traceback of the package, ready or not."""
     process = suite.node('plant', namespace='/early', fresh=True)
     make_probe().wait(lambda: process.stderr)
     process.send(signal.SIGINT)
@@ -91,7 +91,7 @@ def test_signal_during_the_start_is_no_outcry(suite, make_probe):
     process.check_clean()
 
 
-# Runs a command, and tells which threads the middleware has when ROS has ended.
+# Program that runs a command and prints the threads of the middleware after the end of ROS.
 WATCHED = """
 import os, sys
 from fourbar_ros.ros import runtime
@@ -111,7 +111,7 @@ NAMES = ('plant', 'estimator', 'controller', 'record')
 
 
 def has_middleware(process):
-    """Return whether the middleware has made its threads in a process, or the process ended."""
+    """Return whether a process has ended or has threads of the middleware."""
     threads = Path(f'/proc/{process.pid}/task').glob('*/comm')
     return process.poll() is not None or b'dds.' in b''.join(
         path.read_bytes() for path in threads)
@@ -120,9 +120,9 @@ def has_middleware(process):
 @pytest.fixture(scope='module')
 def watched(domain, shared_memory, tmp_path_factory, load_clock):
     """
-    Run commands, all at once, until the middleware has made its threads, and stop them then.
+    Run commands in parallel until they have threads of the middleware, and stop them.
 
-    :returns: what they printed by name and whether they follow simulated time.
+    :returns: stdout by name and whether the command follows simulated time.
     """
     started = {}
     for number, (name, sim_time) in enumerate(product(NAMES, (False, True))):
@@ -137,7 +137,7 @@ def watched(domain, shared_memory, tmp_path_factory, load_clock):
     printed = {}
     try:
         for process in started.values():
-            # The middleware makes its threads before the node takes signals.
+            # The middleware starts its threads before the node handles signals.
             load_clock.wait(partial(has_middleware, process))
             assert process.poll() is None
             shared_memory.note(process.pid)
@@ -153,8 +153,8 @@ def watched(domain, shared_memory, tmp_path_factory, load_clock):
 
 @pytest.mark.parametrize('sim_time', [False, True], ids=['', 'sim_time'])
 @pytest.mark.parametrize('name', NAMES)
-def test_nothing_of_the_middleware_is_left_to_the_end_of_the_process(watched, name, sim_time):
-    """There it waits for its own callbacks, now and then for ever, at full speed."""
+def test_middleware_has_no_threads_at_the_end_of_a_process(watched, name, sim_time):
+    """At the end of a process the middleware may wait for its own callbacks in an endless loop."""
     line, = [line for line in watched[name, sim_time].splitlines() if line.startswith('threads')]
-    # This one belongs to the process.
+    # This thread belongs to the process.
     assert set(line.split()[1:]) <= {'dds.shm.wdog'}

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""`sim/pause`, `sim/step` and `sim/reset` by every clock, through services and `fourbar sim`."""
+"""`sim/pause`, `sim/step`, `sim/reset` in every clock mode, by services and `fourbar sim`."""
 
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -20,13 +20,13 @@ def stamps(messages):
 
 
 def distinct(messages):
-    """Return the stamps; a lock-step sends a tick again if its answer takes long."""
+    """Return the stamps without repetitions: lock-step repeats a tick whose answer is late."""
     return list(dict.fromkeys(stamps(messages)))
 
 
 @pytest.fixture(scope='module', params=['realtime', 'fast', 'lockstep'])
 def testbed(request, module_suite, make_probe):
-    """Run a plant by each clock, its wheels driven by the probe."""
+    """Run a plant in each clock mode, its wheels driven by the probe."""
     namespace = f'/{request.param}'
     process = module_suite.node('plant', {
         'clock': request.param, 'command_timeout': WATCHDOG_S}, namespace)
@@ -42,7 +42,7 @@ def testbed(request, module_suite, make_probe):
 
 @pytest.fixture(autouse=True)
 def running(testbed):
-    """Leave every plant running, disarmed, and where it was."""
+    """Leave every plant running, disarmed, in its initial state."""
     yield
     testbed.drive([0.0] * 4)
     set_initial(testbed, link_a=0.0, link_b=1.0)
@@ -63,7 +63,7 @@ def stamp_in(message):
 
 
 def step(testbed):
-    """Make one tick and return its stamp, once the last one is answered."""
+    """Make one tick after the answer to the last one, and return its stamp."""
     def stepped():
         response = testbed.trigger('sim/step')
         assert response.success or 'not answered yet' in response.message
@@ -74,7 +74,7 @@ def step(testbed):
 
 
 def set_initial(testbed, **values):
-    """Set parameters `initial.*` [rad]: all accepted."""
+    """Set parameters `initial.*` [rad], and check that they are accepted."""
     results = testbed.call(SetParameters, 'plant/set_parameters', SetParameters.Request(
         parameters=[Parameter(name=f'initial.{name}', value=ParameterValue(
             type=ParameterType.PARAMETER_DOUBLE, double_value=value))
@@ -83,10 +83,10 @@ def set_initial(testbed, **values):
 
 
 def quiet(testbed):
-    """Return the last tick, after making sure that none follows for a while."""
+    """Check that no further tick follows, and return the stamp of the last one."""
     testbed.catch_up()
     last = stamps(testbed.received['flywheel_states'])[-1]
-    # As long as the watchdog, which is many periods.
+    # Two diagnostics are at least one command timeout apart.
     testbed.diagnostics(f'{testbed.node.get_namespace()[1:]}/plant',
                         lambda status: 'paused' in status.message)
     testbed.diagnostics(f'{testbed.node.get_namespace()[1:]}/plant')
@@ -95,8 +95,8 @@ def quiet(testbed):
     return last
 
 
-def test_paused_plant_stands_still_armed_and_goes_on(testbed):
-    """Nothing times out meanwhile, although nobody commands for longer than the watchdog bears."""
+def test_paused_plant_stays_armed_and_continues(testbed):
+    """A pause longer than the command timeout does not disarm the plant."""
     testbed.wait(lambda: testbed.arm().success)
     testbed.drive([2e-5] * 4)
     testbed.more('sim/flywheel_states', 50)
@@ -110,13 +110,13 @@ def test_paused_plant_stands_still_armed_and_goes_on(testbed):
     assert testbed.status('device_status')['state'] == 'armed'
     after = [stamp for stamp in distinct(testbed.received['flywheel_states'][count:])
              if stamp > last]
-    # Simulated time has no gap where the pause was, not even by the real-time clock.
+    # Simulated time has no gap at the pause, in the real-time clock mode too.
     assert after[0] == last + PERIOD_NS
     assert after[:50] == list(range(after[0], after[0] + 50 * PERIOD_NS, PERIOD_NS))
 
 
-def test_stopped_while_paused(testbed):
-    """The gate works while time stands still."""
+def test_emergency_stop_acts_while_paused(testbed):
+    """The supervisor handles requests while time stands still."""
     testbed.wait(lambda: testbed.arm().success)
     pause(testbed)
     assert testbed.trigger('emergency_stop').success
@@ -138,7 +138,7 @@ def test_step_is_refused_while_running(testbed):
     assert response.message == 'refused: the clock is running, pause it first'
 
 
-def test_reset_acts_on_the_state_disarms_and_leaves_time_alone(testbed):
+def test_reset_sets_the_state_disarms_and_does_not_change_time(testbed):
     testbed.wait(lambda: testbed.arm().success)
     testbed.drive([3e-5] * 4)
     testbed.more('sim/link_states', 50)
@@ -157,13 +157,13 @@ def test_reset_acts_on_the_state_disarms_and_leaves_time_alone(testbed):
     assert wheels.velocity == pytest.approx([0.0] * 4, abs=1e-9)
 
 
-def test_reset_to_where_the_links_cannot_be_is_refused_and_changes_nothing(testbed):
+def test_reset_to_an_impossible_state_is_refused_and_has_no_effect(testbed):
     testbed.wait(lambda: testbed.arm().success)
     pause(testbed)
     step(testbed)
     testbed.catch_up()
     before = testbed.received['sim/link_states'][-1].position
-    # The paper's links are of one length: rates say nothing where all lie on a line.
+    # The links of the paper have equal lengths: at a change point rates a and b do not suffice.
     set_initial(testbed, link_a=0.0, link_b=0.0, rate_a=1.0)
     response = testbed.trigger('sim/reset')
     set_initial(testbed, rate_a=0.0)
@@ -176,7 +176,7 @@ def test_reset_to_where_the_links_cannot_be_is_refused_and_changes_nothing(testb
     assert testbed.received['sim/link_states'][-1].position == pytest.approx(before, abs=1e-9)
 
 
-def test_command_line_does_the_same(testbed, suite):
+def test_command_line_has_the_same_effect_as_the_services(testbed, suite):
     def sim(action):
         process = suite.start('sim', action, '--ros-args', '-r',
                               f'__ns:={testbed.node.get_namespace()}')

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The tick: one per period, after its samples, answered once, stamps on a grid."""
+"""Ticks: one per period, after the samples, answered once, with stamps on a grid."""
 
 from collections import Counter
 import os
@@ -43,7 +43,7 @@ def testbed(nodes, probe):
     return probe
 
 
-def test_ticks_come_one_per_period_on_a_grid(testbed):
+def test_one_tick_per_period_on_a_grid(testbed):
     ticks = stamps(testbed.more('flywheel_states', 400))
     steps = [later - earlier for earlier, later in zip(ticks, ticks[1:])]
     assert all(step > 0 and step % PERIOD_NS == 0 for step in steps)
@@ -68,11 +68,11 @@ def test_device_publishes_all_its_topics_once_per_tick(testbed, topic):
 
 
 def test_every_tick_is_answered_once_by_all(testbed):
-    """Sensor data may get lost on a busy machine, but never for long and never doubled."""
+    """A run of ticks with all answers exists, since a busy machine may lose messages of others."""
     ticks, received = testbed.received['flywheel_states'], testbed.received
     begin = {topic: len(received[topic]) for topic in (*ANSWERS, 'flywheel_states')}
     run = 200
-    # Looking through them at every message would take longer than they do to come.
+    # A search after every message would take longer than the period of the messages.
     next_look = [begin['flywheel_states'] + run + 20]
 
     def all_answered():
@@ -91,7 +91,7 @@ def test_every_tick_is_answered_once_by_all(testbed):
 
 
 def test_tick_is_sent_after_the_samples_that_belong_to_it(domain, nodes):
-    """By the time that the middleware notes when a message is sent."""
+    """The middleware stamps every message when it is sent."""
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     node = Node('listener', context=context)
@@ -112,7 +112,7 @@ def test_tick_is_sent_after_the_samples_that_belong_to_it(domain, nodes):
     assert all(sent['link_angles'][stamp] < sent['flywheel_states'][stamp] for stamp in common)
 
 
-def test_lost_ticks_are_counted_while_the_controller_stands_still(nodes, testbed):
+def test_lost_ticks_are_counted_while_the_controller_is_stopped(nodes, testbed):
     def lost(message):
         return dict(zip(message.name, message.position))['lost']
     before = lost(testbed.more('timing')[0])

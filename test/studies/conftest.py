@@ -13,13 +13,14 @@ from typing import Any
 import pytest
 import yaml
 
+# Tests of campaigns need packages that a ROS installation does not bring.
 collect_ignore = ([] if all(map(find_spec, ('distributed', 'loky', 'pyarrow'))) else [
     'test_montecarlo_cluster.py', 'test_montecarlo_folder.py', 'test_montecarlo_runs.py'])
-"""Tests of campaigns need packages that a ROS installation does not bring."""
 
+# Longest wait for an event in another process [s]; the machine may be busy.
 TIMEOUT = 300.0
-"""Longest wait for an event in another process [s]; the machine may be busy."""
 
+# A campaign of short runs.
 SHORT_RUNS = {
     'scenario': 'prototype', 'runs': 12, 'seed': 5, 'duration': 0.3,
     'set': {'arm_at': 0.05, 'setpoints[0].at': 0.08, 'setpoints[0].duration': 0.15,
@@ -29,7 +30,6 @@ SHORT_RUNS = {
         'table.link_sensors.noise_rms': {'loguniform': [0.5, 2.0], 'scale': True},
         'controller.allocation': {'choice': ['bounded', 'min_norm']}},
 }
-"""A campaign of short runs."""
 
 
 @pytest.fixture

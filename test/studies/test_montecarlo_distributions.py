@@ -23,8 +23,8 @@ from scipy.stats import kstest, lognorm, loguniform, norm, truncnorm, uniform
 import yaml
 
 RUNS = 2000
+# Share of good samples with which a test would fail; the seeds are fixed.
 SIGNIFICANCE = 1e-3
-"""Share of good samples with which a test would fail; the seeds are fixed."""
 
 
 def campaign(vary: dict[str, Any], **others: Any) -> Campaign:
