@@ -462,7 +462,7 @@ def test_safety_table_of_emulated_links_differs_only_in_timeouts() -> None:
     """The timeout is half a second, because a shared computer may stall."""
     real, emulated = load_safety('prototype'), load_safety('emulated')
     assert {name for name in real if real[name] != emulated[name]} == {
-        'wheel_silent', 'heartbeat_lost'}
+        'wheel_silent', 'heartbeat_lost', 'not_armed', 'unasked_torque'}
     assert emulated['wheel_silent'].limit == 0.5
     assert emulated['wheel_silent'].level == real['wheel_silent'].level
 
