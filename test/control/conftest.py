@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Linkages and controllers that wait for something to do."""
+"""Linkages, and controllers with simple and with simulated plants."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Driven:
         self.stamp_ns = 1_000_000_000
 
     def tick(self) -> Control:
-        """Go on by one tick, and let links and wheels do what they are told."""
+        """Advance by one tick; links and wheels follow reference and command exactly."""
         self.stamp_ns += PERIOD_NS
         control = self.controller.tick(
             self.stamp_ns, self.angles, self.rates, np.zeros(2), self.speeds, self.efforts)
@@ -78,7 +78,7 @@ class Driven:
 
 @pytest.fixture(scope='session')
 def drive(paper: Mechanism) -> Callable[..., Driven]:
-    """Return a function that makes a controller, armed and ticked once unless told."""
+    """Return a function that makes a controller, by default armed after one tick."""
     def make(mechanism: Mechanism = paper, phi_a: float = 0.0, phi_b: float = np.pi / 3,
              branch: str = 'open', armed: bool = True, **settings: float) -> Driven:
         driven = Driven(mechanism, phi_a, phi_b, branch, ControllerSettings(**settings))
@@ -91,9 +91,9 @@ def drive(paper: Mechanism) -> Callable[..., Driven]:
 
 class Steered:
     """
-    A plant and a controller that sees what really is.
+    A plant and a controller with exact inputs.
 
-    :ivar disturbance: (2,) that the controller is told of [N m].
+    :ivar disturbance: disturbance torques for the controller (2,) [N m].
     """
 
     def __init__(self, plant: Plant, controller: Controller) -> None:
@@ -104,10 +104,10 @@ class Steered:
         self._wheel_angles = plant.truth().wheel_angles
 
     def tick(self) -> Control:
-        """Go on by one tick; its command acts until the next."""
+        """Advance by one tick; its command acts until the next one."""
         self.stamp_ns += PERIOD_NS
         truth = self.plant.truth()
-        # As encoders tell them: the mean of the period.
+        # Encoders measure the mean over a period.
         speeds = (truth.wheel_angles - self._wheel_angles) / (PERIOD_NS * 1e-9)
         self._wheel_angles = truth.wheel_angles
         control = self.controller.tick(
@@ -119,13 +119,13 @@ class Steered:
         return control
 
     def ticks(self, count: int) -> list[Control]:
-        """Go on by several."""
+        """Advance by several ticks."""
         return [self.tick() for _ in range(count)]
 
 
 @pytest.fixture(scope='session')
 def steer(paper: Mechanism) -> Callable[..., Steered]:
-    """Return a function that makes a steered plant, armed and ticked once unless told."""
+    """Return a function that makes a steered plant, by default armed after one tick."""
     def make(mechanism: Mechanism = paper, initial: InitialState | None = None,
              armed: bool = True, table: Table = IDEAL, **settings: float | str) -> Steered:
         plant = Plant(mechanism, table, initial or InitialState(), PLANT_STEP,
@@ -141,7 +141,7 @@ def steer(paper: Mechanism) -> Callable[..., Steered]:
 
 @pytest.fixture(scope='session')
 def strong(paper: Mechanism) -> Mechanism:
-    """Make the linkage of the paper with motors that bear fast moves."""
+    """Make the linkage of the paper with motors for fast moves."""
     return replace(paper, motor_torque_limits=np.full(4, 1e-2),
                    motor_speed_limits=np.full(4, 5e4))
 
@@ -154,7 +154,7 @@ def prototype() -> Mechanism:
 
 @pytest.fixture(scope='session')
 def parallelogram() -> Mechanism:
-    """Make a parallelogram with nothing equal but opposite lengths."""
+    """Make a parallelogram whose only equal parameters are opposite lengths."""
     return Mechanism(  # type: ignore[arg-type]
         [0.12, 0.08, 0.12, 0.08], [0.02, 0.03, 0.025, 0.018], [2.2e-5, 1.5e-5, 3e-5, 1.8e-5],
         [[0.05, 0.01], [0.04, -0.01], [0.06, 0.005], [0.05, 0.0]], [3e-7, 4e-7, 5e-7, 2e-7],

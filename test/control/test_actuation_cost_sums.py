@@ -43,14 +43,14 @@ def test_energy_is_that_of_the_wheels_with_their_links(prototype: Mechanism) -> 
 
 @pytest.mark.parametrize('seed', range(3))
 def test_heat_is_that_of_the_energy_budget_of_the_plant(seed: int, prototype: Mechanism) -> None:
-    """The plant has an energy budget of its own; efforts here are means of a period."""
+    """The reference is the energy budget of the plant; efforts are means over a period."""
     plant = Plant(prototype, Table(LinkSensorSettings(), WheelEncoders(0)), InitialState(), 5e-4,
                   np.random.default_rng(0))
     cost, rng = ActuationCostSums(prototype), np.random.default_rng(seed)
     for _ in range(50):
         torques = rng.uniform(-0.004, 0.004, 4)
-        # Motors that have come to what they are asked for: the square of a mean is the mean of
-        # squares then.
+        # The motor torques are constant after the lag, so the square of the mean is the mean of
+        # squares.
         plant.advance(200, torques)
         before = plant.ledger().copper
         plant.advance(8, torques)

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Wheels meet what the axes need, at the least cost, as far as their motors can."""
+"""Control allocation: demands, costs, bounds, and lost directions."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ from scipy.optimize import linprog, minimize, nnls
 Array = NDArray[np.float64]
 SEEDS = range(40)
 
-# A demand of this size in torques of that size, to which the tolerances refer [N m].
+# Size of demands and torques, to which the tolerances refer [N m].
 SIZE = 1e-4
-# Gains of the drawn linkages are above WEAK, Gamma is at most 8: a few roundings of their ratio,
-# or what a torque may exceed a bound by before it is clipped (1e-10 of the torques, times Gamma).
+# Gains of the random linkages are above WEAK, and Gamma is at most 8. The error is a few roundings
+# of their ratio, or the clipping of torques beyond a bound (1e-10 of the torques, times Gamma).
 MET = 1e-8 * SIZE
 
 NO_LIMIT = np.full(4, np.inf)
@@ -99,9 +99,9 @@ Draw = Callable[[int], Problem]
 @pytest.fixture(scope='module')
 def draw(uneven: Mechanism) -> Draw:
     """
-    Draw a linkage, two axes or three, and a demand, up to three times what the motors can give.
+    Draw a linkage, two or three axes, and a demand up to three times the capacity of the motors.
 
-    Every fifth motor is at its speed limit, one wheel may have failed; all axes can be driven.
+    Every fifth motor is at its speed limit, one wheel may be faulty; all axes can be driven.
     """
     def make(seed: int) -> Problem:
         rng = np.random.default_rng(seed)
@@ -135,8 +135,8 @@ def unlimited(problem: Problem) -> Problem:
 
 @each_allocation
 @each_seed
-def test_demand_is_met_as_far_as_the_wheels_can(name: str, seed: int, draw: Draw) -> None:
-    """Two wheels of two pairs cannot drive three axes; two axes they can almost everywhere."""
+def test_demand_is_met_within_the_capacity_of_the_wheels(name: str, seed: int, draw: Draw) -> None:
+    """Two wheels of two pairs drive two axes almost everywhere, and never three."""
     problem = unlimited(draw(seed))
     torques, scale = problem.share(name)
     directions, shares = controllable(problem.wheel_map, problem.metric(name))
@@ -148,7 +148,7 @@ def test_demand_is_met_as_far_as_the_wheels_can(name: str, seed: int, draw: Draw
 
 @each_norm
 @each_seed
-def test_any_other_answer_costs_more(name: str, seed: int, draw: Draw) -> None:
+def test_any_other_allocation_costs_more(name: str, seed: int, draw: Draw) -> None:
     problem = unlimited(draw(seed))
     metric = problem.metric(name)
     used = metric > 0.0
@@ -183,7 +183,7 @@ def test_two_wheels_are_one_of_each_pair(available: tuple[int, ...], used: tuple
     np.testing.assert_array_equal(metric > 0.0, np.array(used, dtype=bool))
 
 
-def test_wheel_that_failed_is_left_alone_by_all() -> None:
+def test_faulty_wheel_has_no_torque_in_any_allocation() -> None:
     for name in ALLOCATIONS:
         for wheel in range(4):
             available = np.arange(4) != wheel
@@ -195,7 +195,7 @@ def test_unknown_allocation_is_refused(refuses: Refuses) -> None:
         make_allocation('even', np.ones(4), [True] * 4)
 
 
-def test_twins_of_the_rhombus_share_equally(paper: Mechanism) -> None:
+def test_paired_wheels_of_the_rhombus_share_equally(paper: Mechanism) -> None:
     for theta in (0.4, pi / 3, pi / 2, 2.5):
         form = reduced_form(paper, assemble(paper, 0.3, 0.3 + theta), np.zeros(2))
         torques, _ = Problem(
@@ -205,13 +205,13 @@ def test_twins_of_the_rhombus_share_equally(paper: Mechanism) -> None:
 
 
 @pytest.mark.parametrize(('name', 'ratio'), [('min_norm', 4.0), ('min_energy', 2.0)])
-def test_bigger_wheel_of_a_pair_takes_the_bigger_share(name: str, ratio: float, paper: Mechanism
+def test_larger_wheel_of_a_pair_takes_the_larger_share(name: str, ratio: float, paper: Mechanism
                                                        ) -> None:
     """
-    Twice the inertia: four times the torque, or twice.
+    A wheel with twice the inertia takes four times or twice the torque.
 
-    Least accelerations s with If s1 + If s2 given are as If, so torques as its square; least
-    energy has equal accelerations, so torques as If.
+    Least accelerations s at a given sum of If s are proportional to If, so torques to its square;
+    least energy has equal accelerations, so torques proportional to If.
     """
     inertias = np.array([3e-7, 3e-7, 6e-7, 6e-7])
     form = reduced_form(paper, assemble(paper, 0.0, pi / 3), np.zeros(2))
@@ -255,13 +255,13 @@ def quarter_turn(mechanism: Mechanism, name: str) -> tuple[float, float, Array]:
     ('two_wheels', 124.74, 5.2904e-3)])
 def test_quarter_turn_of_the_paper(name: str, speed: float, energy: float, paper: Mechanism
                                    ) -> None:
-    """The numbers follow by hand from A = 1.44e-4 kg m^2 and the peak rate of the soft step."""
+    """The expected values follow from A = 1.44e-4 kg m^2 and the peak rate of the soft step."""
     assert quarter_turn(paper, name)[:2] == (
         pytest.approx(speed, abs=0.005), pytest.approx(energy, abs=5e-8))
 
 
 def test_least_energy_keeps_the_speeds_of_unequal_wheels_equal(paper: Mechanism) -> None:
-    """And it is the least energy for the momentum of a pair: its square over twice the inertia."""
+    """The energy is the least one of a pair: momentum squared over twice the inertia."""
     uneven_wheels = replace(
         paper, flywheel_inertias=paper.flywheel_inertias * np.array([1.0, 2.0, 3.0, 0.5]))
     inertias = uneven_wheels.flywheel_inertias
@@ -274,7 +274,7 @@ def test_least_energy_keeps_the_speeds_of_unequal_wheels_equal(paper: Mechanism)
     assert inertias @ speeds ** 2 < 0.9 * (inertias @ others ** 2)
 
 
-# All scaled together
+# Proportional scaling
 
 @pytest.mark.parametrize('name', ALLOCATIONS[:3])
 @each_seed
@@ -284,12 +284,12 @@ def test_torques_are_reduced_in_proportion(name: str, seed: int, draw: Draw) -> 
     full, _ = unlimited(problem).share(name)
     np.testing.assert_allclose(torques, scale * full, rtol=0.0, atol=1e-9 * SIZE)
     assert (torques <= problem.upper).all() and (torques >= problem.lower).all()
-    # No more than needed: one of them is at its bound.
+    # The scaling is the smallest one: one torque is at its bound.
     margin = np.where(full > 0.0, problem.upper - torques, torques - problem.lower)
     assert scale == 1.0 or margin[full != 0.0].min() <= 1e-9 * SIZE
 
 
-def test_rounding_at_a_bound_of_zero_stops_nobody() -> None:
+def test_rounding_at_a_bound_of_zero_does_not_stop_the_others() -> None:
     rows = np.array([[1.0, 0.0, 1.0, 1e-17], [0.0, 1.0, -1e-17, 1.0]])
     upper = np.array([1.0, 0.0, 1.0, 0.0])
     problem = Problem(rows, np.array([-1.0, 0.0]), np.ones(4), np.ones(4, dtype=bool),
@@ -300,7 +300,7 @@ def test_rounding_at_a_bound_of_zero_stops_nobody() -> None:
         np.testing.assert_allclose(torques, [0.5, 0.0, 0.5, 0.0], rtol=1e-15)
 
 
-# The best within the bounds
+# Optimum within the bounds
 
 def admitted(problem: Problem) -> float:
     """Return the largest scale that the bounds admit, by a linear program; at most 10."""
@@ -323,9 +323,9 @@ def pushes_of(problem: Problem) -> tuple[Array, Array, Array]:
 
 def circles(problem: Problem) -> tuple[float, float]:
     """
-    Return how far wheels within bounds can push the axes.
+    Return bounds of the demand that wheels can meet.
 
-    :returns: at least, and more than at most: if all pushed one way as strongly as the strongest.
+    :returns: lower bound, and an upper bound, at which all wheels give the largest torque.
     """
     pushes, low, high = pushes_of(problem)
     count = len(pushes)
@@ -349,13 +349,13 @@ def test_without_margin_the_scale_is_what_the_bounds_admit(seed: int, draw: Draw
     goal[:len(directions)] = -directions @ problem.demand
     scale = largest_scale(ReducedProblem(
         effectiveness, gains, goal, len(directions), low, high, np.ones(4)), 0.0)
-    # The tolerance of the linear program.
+    # The tolerance is that of the linear program.
     assert min(scale, 10.0) == pytest.approx(admitted(problem), abs=1e-7)
 
 
 @each_seed
 def test_demand_is_met_in_proportion_within_bounds(seed: int, draw: Draw) -> None:
-    """And the margin costs no more than its share of the most."""
+    """The scale is at least the largest one times the margin."""
     problem = draw(seed)
     torques, scale = problem.share('bounded')
     np.testing.assert_allclose(
@@ -370,12 +370,12 @@ def test_demand_is_met_in_proportion_within_bounds(seed: int, draw: Draw) -> Non
 
 
 @each_seed
-def test_torques_within_bounds_have_their_certificate(seed: int, draw: Draw) -> None:
+def test_torques_within_bounds_meet_the_optimality_conditions(seed: int, draw: Draw) -> None:
     """
-    They meet the conditions of Karush, Kuhn and Tucker, which in a convex problem are enough.
+    The Karush-Kuhn-Tucker conditions are sufficient in a convex problem.
 
-    The gradient tau / v is what multipliers make of the rows, less a force at upper bounds, plus
-    one at lower bounds; forces are not negative.
+    The gradient tau / v is the rows times multipliers, minus non-negative multipliers of the upper
+    bounds, plus those of the lower bounds.
     """
     problem = draw(seed)
     torques, _ = problem.share('bounded')
@@ -388,7 +388,7 @@ def test_torques_within_bounds_have_their_certificate(seed: int, draw: Draw) -> 
     walls, rows = np.eye(used.sum()), problem.wheel_map[:, used].T
     _, residual = nnls(np.column_stack(
         [rows, -rows, -walls[:, at_upper], walls[:, at_lower]]), gradient)
-    # What is within 1e-9 of a bound counts as there; the rows make ten times as much of it.
+    # Torques within 1e-9 of a bound count as at the bound; the rows amplify that by ten.
     assert residual < 1e-8
 
 
@@ -408,7 +408,7 @@ def test_torques_within_bounds_are_those_of_a_general_solver(seed: int, draw: Dr
     np.testing.assert_allclose(torques[used] / SIZE, solution.x, rtol=0.0, atol=1e-6)
 
 
-def test_partner_stands_in_for_a_wheel_at_its_speed_limit(paper: Mechanism) -> None:
+def test_partner_replaces_a_wheel_at_its_speed_limit(paper: Mechanism) -> None:
     form = reduced_form(paper, assemble(paper, 0.0, pi / 3), np.zeros(2))
     problem = Problem(form.wheel_map, np.array([-5e-5, 2e-5]), paper.flywheel_inertias,
                       np.ones(4, dtype=bool), np.full(4, -1e-4), np.array([0.0, 1e-4, 1e-4, 1e-4]))
@@ -422,12 +422,12 @@ def test_partner_stands_in_for_a_wheel_at_its_speed_limit(paper: Mechanism) -> N
 
 def lipschitz(problem: Problem) -> float:
     """
-    Return what a change of the demand is multiplied by in torques at most.
+    Return the Lipschitz constant of the torques as a function of the demand.
 
-    Torques of least norm are those of some wheels alone, pinned or not. What is asked of them
-    follows the demand, or its way out of what the bounds admit: between an inner and an outer
-    circle, it turns by as much, and is cut by at most the ratio of the two. The margin moves the
-    inner circle in.
+    Torques of least norm are those of some wheels, with the others at their bounds. They meet the
+    demand or its projection to the admissible region. The boundary of this region lies between an
+    inner and an outer circle, so a change of direction is amplified by at most the ratio of the
+    radii. The margin reduces the inner radius.
     """
     pushes, _, _ = pushes_of(problem)
     steepest = max(1.0 / np.linalg.svd(pushes[:, [i, k]], compute_uv=False)[-1]
@@ -456,9 +456,9 @@ def test_torques_follow_the_demand_without_jumps(seed: int, draw: Draw) -> None:
 
 
 @pytest.mark.parametrize('mismatch', [1e-12, 1e-6, 1e-4])
-def test_pair_with_little_to_do_does_not_work_against_itself(mismatch: float, paper: Mechanism
-                                                             ) -> None:
-    """Lengths that almost match give almost the torques of lengths that do, at the limit too."""
+def test_pair_with_small_demand_has_no_opposite_torques(mismatch: float, paper: Mechanism
+                                                        ) -> None:
+    """Almost equal lengths give almost the torques of equal lengths, at the limit too."""
     longer = replace(paper, link_lengths=paper.link_lengths * (1.0 + mismatch * np.arange(4.0)))
     shared = []
     for mechanism in (paper, longer):
@@ -468,12 +468,12 @@ def test_pair_with_little_to_do_does_not_work_against_itself(mismatch: float, pa
             np.ones(4, dtype=bool), np.full(4, -1e-4), np.full(4, 1e-4)).share('bounded')
         assert scale < 1.0
         shared.append(torques)
-    # Gamma differs by ten times the mismatch; the torques of two wheels, by that much of both.
+    # Gamma differs by ten times the mismatch, and the torques of two wheels by that share of both.
     np.testing.assert_allclose(shared[1], shared[0], rtol=0.0, atol=1e-13 + 1e-4 * 40 * mismatch)
 
 
-def test_pair_at_its_speed_limit_does_not_set_the_other_against_itself(paper: Mechanism) -> None:
-    """Though wheels a and c could give a little of what b and d cannot, working in opposition."""
+def test_pair_at_its_speed_limit_causes_no_opposite_torques_of_the_other(paper: Mechanism) -> None:
+    """Opposite torques of wheels a and c could replace a small part of b and d."""
     longer = replace(paper, link_lengths=paper.link_lengths * (1.0 + 1e-3 * np.arange(4.0)))
     form = reduced_form(longer, assemble(longer, 0.0, 1.0), np.zeros(2))
     assert abs(form.gamma[0, 1]) > 1e-4
@@ -486,7 +486,7 @@ def test_pair_at_its_speed_limit_does_not_set_the_other_against_itself(paper: Me
 
 # Directions that cannot be driven
 
-def test_axis_without_wheels_is_dropped_and_the_other_met(paper: Mechanism) -> None:
+def test_axis_without_wheels_is_dropped_and_the_other_one_is_met(paper: Mechanism) -> None:
     form = reduced_form(paper, assemble(paper, 0.2, 1.4), np.zeros(2))
     problem = Problem(form.wheel_map, np.array([3e-5, -4e-5]), paper.flywheel_inertias,
                       np.array([False, True, False, True]), np.full(4, -1e-4), np.full(4, 1e-4))
@@ -502,12 +502,12 @@ def test_axis_without_wheels_is_dropped_and_the_other_met(paper: Mechanism) -> N
 
 @each_seed
 def test_directions_are_orthonormal_and_wheels_act_on_each_alone(seed: int, draw: Draw) -> None:
-    """They are the left singular vectors of rows v^(1/2)."""
+    """The directions are the left singular vectors of rows v^(1/2)."""
     problem = draw(seed)
     metric = problem.metric('min_energy')
     directions, shares = controllable(problem.wheel_map, metric)
     pushes = directions @ problem.wheel_map * np.sqrt(metric / metric.max())
-    # Entries are up to 8 and so are the gains.
+    # Entries and gains are at most 8.
     np.testing.assert_allclose(directions @ directions.T, np.eye(len(shares)), atol=1e-14)
     product = pushes @ pushes.T
     np.testing.assert_allclose(product - np.diag(np.diag(product)), 0.0, atol=1e-12)
@@ -518,9 +518,9 @@ def test_directions_are_orthonormal_and_wheels_act_on_each_alone(seed: int, draw
         rtol=1e-12)
 
 
-def test_demand_fades_before_torques_grow() -> None:
+def test_demand_is_reduced_before_torques_grow() -> None:
     """
-    Wheels b and c drive both axes, until c lies so that it cannot drive a.
+    Wheels b and c drive both axes until wheel c has no leverage on axis a.
 
     Torques are at most 1 / WEAK times the demand. As a function of the rows they are the demand
     times a function of singular values, whose slope is steepest next to LOST: (f / gain)' =
@@ -549,7 +549,7 @@ def test_demand_fades_before_torques_grow() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize('kind', ['proportional', 'bounded', 'min_max_speed'])
 def test_torques_are_finite_and_within_bounds_for_any_problem(kind: str) -> None:
-    """Dependent rows, no demand, no room, no wheels, sizes apart by many orders; seed 5."""
+    """Cases: dependent rows, zero demand, empty bounds, no wheels, unequal sizes; seed 5."""
     rng = np.random.default_rng(5)
     for trial in range(20_000):
         count = int(rng.integers(1, 4))
@@ -577,10 +577,10 @@ def test_torques_are_finite_and_within_bounds_for_any_problem(kind: str) -> None
             continue
         directions, shares = controllable(rows, metric)
         missed = directions @ (rows @ torques) + scale * shares * (directions @ demand)
-        # Bounds may be exceeded by 1e-10 of torques up to scale demand / WEAK, which are clipped,
-        # and a row makes 60 times as much of it.
+        # Torques up to scale demand / WEAK may exceed a bound by 1e-10 and are then clipped; a
+        # row amplifies that by 60.
         limit = 1e-10 / WEAK * 60.0 * scale * np.linalg.norm(demand)
         if kind == 'min_max_speed':
-            # The null space adds torques up to the bounds of 2 N m, that are rounded as well.
+            # The null space adds torques up to the bounds of 2 N m with the same relative error.
             limit += 1e-10 * 2.0 * 60.0
         assert (np.abs(missed[shares > 0.0]) <= limit + 1e-12).all(), f'trial {trial}'

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Branches are where the loop closes, and two meet where all links are in line."""
+"""Branches: closure, names, projection, and change points where two branches meet."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SEEDS = range(10)
 each_seed = pytest.mark.parametrize('seed', SEEDS)
 each_branch = pytest.mark.parametrize('branch', BRANCHES, ids=lambda branch: branch.name)
 
-# Where two branches meet, by the angle between their pairs.
+# Pairs of branches that meet, each with the angle between its pairs.
 MEETINGS = (
     (PARALLELOGRAM, 0.0, FOLDED, 0.0), (PARALLELOGRAM, pi, CROSSED, pi),
     (FOLDED, pi, CROSSED, 0.0),
@@ -44,8 +44,8 @@ def pose(branch: Branch, heading: float, theta: float) -> Array:
 
 @each_branch
 @each_seed
-def test_loop_closes_all_along_it(seed: int, branch: Branch, paper: Mechanism) -> None:
-    """Angles and rates: no gap opens, whatever the pairs do."""
+def test_loop_closes_on_the_whole_branch(seed: int, branch: Branch, paper: Mechanism) -> None:
+    """Angles and rates of the links meet the closure for any motion of the pairs."""
     rng = np.random.default_rng(seed)
     angles = pose(branch, *rng.uniform(-3.0, 3.0, 2))
     rates = branch.to_links(rng.uniform(-1.0, 1.0, 2), np.zeros(2))
@@ -55,20 +55,20 @@ def test_loop_closes_all_along_it(seed: int, branch: Branch, paper: Mechanism) -
 
 
 @each_branch
-def test_it_has_the_name_that_the_closure_gives_it(branch: Branch) -> None:
+def test_name_agrees_with_the_closure(branch: Branch) -> None:
     names = {'parallelogram': 'open'}
     assert branch_of(pose(branch, 0.3, 0.9)) == names.get(branch.name, branch.name)
 
 
 @each_branch
 @each_seed
-def test_turns_and_noise_do_not_hide_it(seed: int, branch: Branch, paper: Mechanism) -> None:
+def test_branch_is_found_from_noisy_angles(seed: int, branch: Branch, paper: Mechanism) -> None:
     rng = np.random.default_rng(seed)
     exact = pose(branch, 0.4, rng.uniform(0.1, pi - 0.1)) + 2.0 * pi * rng.integers(-2, 3, 4)
     measured = exact + rng.uniform(-4e-3, 4e-3, 4)
     assert branch_at(paper, measured, any_branch=True) == branch, f'seed {seed}'
     near = branch.nearest(measured)
-    # On the branch, on the same turns, and no farther than the mean of two errors.
+    # The projection is on the branch and the same turns; its error is at most that of the angles.
     assert closure_error(paper, near) < 1e-15
     assert np.abs(near - exact).max() <= 4e-3
     off = measured - near
@@ -76,7 +76,7 @@ def test_turns_and_noise_do_not_hide_it(seed: int, branch: Branch, paper: Mechan
 
 
 @pytest.mark.parametrize(('one', 'theta', 'other', 'theta_there'), MEETINGS)
-def test_two_meet_where_all_links_are_in_line(
+def test_two_branches_meet_where_all_links_are_in_line(
     one: Branch, theta: float, other: Branch, theta_there: float, paper: Mechanism,
     parallelogram: Mechanism,
 ) -> None:
@@ -88,7 +88,7 @@ def test_two_meet_where_all_links_are_in_line(
     assert adjoining_branch(parallelogram, PARALLELOGRAM, angles) is None
 
 
-def test_only_a_rhombus_has_all(paper: Mechanism, parallelogram: Mechanism) -> None:
+def test_only_a_rhombus_has_all_branches(paper: Mechanism, parallelogram: Mechanism) -> None:
     for branch in BRANCHES[1:]:
         angles = pose(branch, 0.3, 0.9)
         assert branch_at(paper, angles) is None

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Setpoints that name the other branch at a change point are taken, and only there."""
+"""Setpoints on another branch are accepted at a change point, and nowhere else."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PERIOD = 4e-3
 
 
 def standing(drive: Drive, theta: float = 0.0, **settings: Any) -> Any:
-    """Make a controller that stands on the parallelogram, at a change point too."""
+    """Make a controller at rest on the parallelogram branch."""
     driven = drive(armed=False, **settings)
     driven.angles = np.array([0.0, theta, 0.0, theta])
     driven.controller.device_armed(True)
@@ -36,12 +36,12 @@ def standing(drive: Drive, theta: float = 0.0, **settings: Any) -> Any:
 
 
 def go(driven: Any, names: Sequence[str], positions: Sequence[float]) -> None:
-    """Make a move, the loop staying closed and the reference continuous, and rest."""
+    """Run a move to its end; check closure and continuity of the reference."""
     driven.controller.setpoint(names, positions)
     before = driven.angles
     for _ in range(round(driven.controller.settings.setpoint_duration / PERIOD) + 2):
         angles = driven.tick().reference_angles
-        # Half a turn in 2 s, and what the change of branch takes.
+        # The bound is the peak rate of half a turn in 2 s, and the step at the change of branch.
         assert np.abs(angles - before).max() < 1e-3 + 1.875 * pi / 2.0 * PERIOD
         assert closure_error(driven.controller.mechanism, angles) < 1e-14
         before = angles
@@ -50,14 +50,14 @@ def go(driven: Any, names: Sequence[str], positions: Sequence[float]) -> None:
 
 @pytest.mark.parametrize('names', [ALL, ('link_a', 'link_c'), ('link_b', 'link_d')])
 def test_out_on_the_folded_branch_and_back(names: Sequence[str], drive: Drive) -> None:
-    """Two named links are enough if they tell the branch."""
+    """Two named links suffice if they determine the branch."""
     driven = standing(drive, 0.0, change_points='choose', setpoint_duration=2.0)
     assert driven.controller.branch == 'parallelogram'
     goal = dict(zip(ALL, (0.1, 0.1, 0.6, 0.6)))
     go(driven, names, [goal[name] for name in names])
     assert driven.controller.branch == 'folded'
     np.testing.assert_allclose(driven.angles, [0.1, 0.1, 0.6, 0.6], atol=1e-12)
-    # On it, one link turns its pair.
+    # On the branch, one named link turns its pair.
     go(driven, ['link_d'], [0.4])
     np.testing.assert_allclose(driven.angles, [0.1, 0.1, 0.4, 0.4], atol=1e-12)
     go(driven, ['link_c', 'link_b'], [0.2, 0.2])
@@ -68,7 +68,7 @@ def test_out_on_the_folded_branch_and_back(names: Sequence[str], drive: Drive) -
 
 
 def test_round_through_all_three_branches(drive: Drive) -> None:
-    """Parallelogram, folded, crossed and back, each by the change point where they meet."""
+    """The way is parallelogram, folded, crossed and back through the change points."""
     driven = standing(drive, 0.0, change_points='choose', setpoint_duration=4.0)
     go(driven, ALL, (0.0, 0.0, 1.0, 1.0))
     go(driven, ALL, (0.0, 0.0, pi, pi))
@@ -82,8 +82,8 @@ def test_round_through_all_three_branches(drive: Drive) -> None:
                                atol=1e-9)
 
 
-def test_what_fits_on_the_present_branch_stays_on_it(drive: Drive) -> None:
-    """A single link, or two that mean either branch."""
+def test_setpoint_on_the_present_branch_stays_on_it(drive: Drive) -> None:
+    """The setpoints name a single link, or two links with equal angles on both branches."""
     for names, positions in ((['link_c'], [0.5]), (['link_a', 'link_d'], [0.0, 0.5])):
         driven = standing(drive, 0.0, change_points='choose', setpoint_duration=2.0)
         go(driven, names, positions)
@@ -99,7 +99,7 @@ def test_what_fits_on_the_present_branch_stays_on_it(drive: Drive) -> None:
     ('choose', 0.5, ('link_a', 'link_c'), (0.0, 0.5), {'condition': 'rest_at_change_point'}),
     ('choose', 2e-3, ('link_a', 'link_c'), (0.0, 0.5), {'condition': 'rest_at_change_point'}),
 ], ids=range(6))
-def test_it_is_refused_with_the_reason(
+def test_other_branch_is_refused_with_the_reason(
     change_points: str, theta: float, names: Sequence[str], positions: Sequence[float],
     values: dict[str, Any], drive: Drive, refuses: Refuses,
 ) -> None:
@@ -112,7 +112,7 @@ def test_it_is_refused_with_the_reason(
     np.testing.assert_array_equal(driven.tick().reference_angles, before)
 
 
-def test_while_it_moves_it_is_refused(drive: Drive, refuses: Refuses) -> None:
+def test_other_branch_is_refused_during_a_move(drive: Drive, refuses: Refuses) -> None:
     driven = standing(drive, -0.5, change_points='choose', setpoint_duration=4.0)
     driven.controller.setpoint(['link_b'], [0.5])
     for _ in range(500):
@@ -139,7 +139,7 @@ def test_links_of_two_lengths_have_no_other_branch(
         driven.controller.setpoint(['link_a', 'link_c'], [0.0, 0.5])
 
 
-def test_what_the_wheels_cannot_give_is_refused_there_too(drive: Drive) -> None:
+def test_demand_beyond_the_limits_is_refused_on_a_branch(drive: Drive) -> None:
     driven = standing(drive, 0.0, change_points='choose', setpoint_duration=0.1)
     with pytest.raises(SetpointError) as caught:
         driven.controller.setpoint(['link_a', 'link_c'], [0.0, 1.0])
@@ -150,8 +150,8 @@ def test_what_the_wheels_cannot_give_is_refused_there_too(drive: Drive) -> None:
     assert driven.controller.branch == 'folded'
 
 
-def test_trajectories_go_along_the_branch(drive: Drive) -> None:
-    """Named rates are those of the pair, and one named link leaves the other pair alone."""
+def test_trajectories_follow_the_branch(drive: Drive) -> None:
+    """Named rates are those of the pair; the pair without a named link holds."""
     driven = standing(drive, 0.0, change_points='choose', setpoint_duration=2.0)
     go(driven, ALL, (0.0, 0.0, 0.5, 0.5))
     driven.controller.trajectory(
@@ -160,13 +160,13 @@ def test_trajectories_go_along_the_branch(drive: Drive) -> None:
         control = driven.tick()
         assert closure_error(driven.controller.mechanism, control.reference_angles) < 1e-14
         if abs(tick - 500) <= 1:
-            # A tick later or sooner, the rate has changed by what 1 rad/s^2 does.
+            # The tick may be off by one; the acceleration is 1 rad/s^2.
             np.testing.assert_allclose(control.reference_rates, [0.0, 0.0, 0.1, 0.1], atol=PERIOD)
     np.testing.assert_allclose(driven.angles, [0.0, 0.0, 0.9, 0.9], atol=1e-12)
 
 
-def test_armed_on_another_branch_it_holds_there(drive: Drive) -> None:
-    """With `select_branch` it knows the branches; else it is the reduced form that holds."""
+def test_controller_armed_on_another_branch_holds_there(drive: Drive) -> None:
+    """It holds by the branch with `select_branch`, and by the reduced form otherwise."""
     for change_points, branch in (('choose', 'crossed'), ('keep', 'crossed')):
         driven = drive(phi_b=1.0, branch='crossed', change_points=change_points)
         assert driven.controller.branch == branch

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Terms of paper eq. 6 on axes that exist at change points too, and what errors ask of them."""
+"""Terms of paper eq. 6 on axes that are regular at change points, and the feedback law."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Axes:
 
     @property
     def inertias(self) -> Array:
-        """All of the mass matrix that is known."""
+        """The known elements of the mass matrix."""
         return np.array([self.a00, self.a01, self.a11, *self.eta_row])
 
 
@@ -79,7 +79,7 @@ def on_branch(phi_a: float, theta: float) -> Array:
 
 
 def check_reduced_form(axes: Axes, form: ReducedForm, seed: int) -> None:
-    # The reduced form divides by |sin theta|^2 of 0.09, and loses as much.
+    # The reduced form divides by |sin theta|^2 = 0.09, which amplifies the rounding.
     scale = np.abs(form.mass_matrix).max()
     np.testing.assert_allclose(axes.matrix, form.mass_matrix, atol=1e-14 * scale,
                                err_msg=f'seed {seed}')
@@ -99,7 +99,7 @@ def mechanism(linkage: str, request: pytest.FixtureRequest) -> Mechanism:
 
 @each_seed
 @each_parallelogram
-def test_on_the_parallelogram_it_is_the_reduced_form(
+def test_parallelogram_agrees_with_the_reduced_form(
     seed: int, linkage: str, mechanism: Mechanism,
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -110,8 +110,8 @@ def test_on_the_parallelogram_it_is_the_reduced_form(
 
 
 @each_seed
-def test_elsewhere_it_is_the_reduced_form_with_no_third_axis(seed: int, uneven: Mechanism
-                                                             ) -> None:
+def test_general_linkage_has_the_reduced_form_without_a_third_axis(seed: int, uneven: Mechanism
+                                                                   ) -> None:
     rng = np.random.default_rng(seed)
     angles = assemble(uneven, 0.3 * seed, 0.3 * seed + rng.uniform(0.9, 2.0),
                       'open' if seed % 2 else 'crossed')
@@ -129,10 +129,10 @@ def test_elsewhere_it_is_the_reduced_form_with_no_third_axis(seed: int, uneven: 
 
 @pytest.mark.parametrize('theta', [0.0, pi, -pi, 2.0 * pi])
 @each_parallelogram
-def test_through_change_points_all_is_finite_and_continuous(
+def test_terms_are_finite_and_continuous_through_change_points(
     theta: float, linkage: str, mechanism: Mechanism,
 ) -> None:
-    """What changes is cosines and sines of theta, so not by more than it; the row of eta not."""
+    """Terms vary as cosines and sines of theta; the row of eta is constant."""
     rates, step = np.array([0.7, -1.3, 0.7, -1.3]), 1e-6
     before, at, after = (axes_at(mechanism, on_branch(0.4, theta + change), rates, True)
                          for change in (-step, 0.0, step))
@@ -148,10 +148,10 @@ def test_through_change_points_all_is_finite_and_continuous(
 
 @pytest.mark.parametrize('theta', [0.0, pi])
 @each_parallelogram
-def test_row_of_eta_is_the_motion_that_the_closure_leaves_free(
+def test_row_of_eta_is_the_free_motion_of_the_closure(
     theta: float, linkage: str, mechanism: Mechanism,
 ) -> None:
-    """`l_c eta_c = l_a eta_a` and so on: joint 3 stays closed, the pairs stay where they are."""
+    """By `l_c eta_c = l_a eta_a` and so on joint 3 stays closed and the pairs do not turn."""
     angles = on_branch(0.4, theta)
     rows = axes_at(mechanism, angles, NONE, True).wheel_map
     free = rows[2]
@@ -166,7 +166,7 @@ def test_row_of_eta_is_the_motion_that_the_closure_leaves_free(
 def test_inertia_of_the_three_axes_is_that_of_the_links(
     seed: int, linkage: str, mechanism: Mechanism,
 ) -> None:
-    """The kinetic energy of any rates on the axes."""
+    """The kinetic energies of any rates on the axes agree."""
     rng = np.random.default_rng(seed)
     angles = on_branch(rng.uniform(-3.0, 3.0), rng.uniform(-0.1, 0.1))
     axes, on_axes = axes_at(mechanism, angles, NONE, True), rng.uniform(-1.0, 1.0, 3)
@@ -180,7 +180,7 @@ def test_inertia_of_the_three_axes_is_that_of_the_links(
 
 @each_seed
 @each_parallelogram
-def test_errors_are_those_of_the_pairs_and_eta_is_what_is_left(
+def test_errors_are_those_of_the_pairs_and_of_eta(
     seed: int, linkage: str, mechanism: Mechanism,
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -206,10 +206,10 @@ def on_other(branch: Branch, phi_a: float, theta: float) -> Array:
 @pytest.mark.parametrize('theta', [0.0, pi])
 @pytest.mark.parametrize('branch', [FOLDED, CROSSED], ids=lambda branch: branch.name)
 @pytest.mark.parametrize('linkage', ['paper', 'prototype'])
-def test_row_of_eta_on_other_branches_is_what_the_closure_leaves_free(
+def test_row_of_eta_on_other_branches_is_the_free_motion(
     linkage: str, branch: Branch, theta: float, turn: float, mechanism: Mechanism,
 ) -> None:
-    """The twins turn apart, joint 3 stays closed; also with a twin a turn ahead."""
+    """Paired links turn apart and joint 3 stays closed, also with a difference of one turn."""
     angles = on_other(branch, 0.4, theta)
     angles[branch.followers[1]] += turn
     axes = axes_at(mechanism, angles, NONE, True, paired_links=branch.paired_links)
@@ -226,10 +226,10 @@ def test_row_of_eta_on_other_branches_is_what_the_closure_leaves_free(
 
 @each_seed
 @pytest.mark.parametrize('linkage', ['paper', 'prototype'])
-def test_on_the_crossed_branch_it_is_the_reduced_form(
+def test_crossed_branch_agrees_with_the_reduced_form(
     seed: int, linkage: str, mechanism: Mechanism,
 ) -> None:
-    """Whose axes are links a and b, too."""
+    """The axes of the crossed branch are links a and b."""
     rng = np.random.default_rng(seed)
     theta = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, pi - 0.3)
     angles = on_other(CROSSED, rng.uniform(-3.0, 3.0), theta)
@@ -244,7 +244,7 @@ def test_on_the_crossed_branch_it_is_the_reduced_form(
 def test_folded_and_crossed_branch_are_the_same_for_identical_links(
     seed: int, linkage: str, mechanism: Mechanism,
 ) -> None:
-    """Two bars of twins on one hinge, at their far ends or their near ones: turned by pi."""
+    """The two branches differ by a turn of one pair by pi."""
     rng = np.random.default_rng(seed)
     phi, theta = rng.uniform(-3.0, 3.0, 2)
     rates = rng.uniform(-2.0, 2.0, 2)
@@ -259,8 +259,8 @@ def test_folded_and_crossed_branch_are_the_same_for_identical_links(
                                err_msg=f'seed {seed}')
 
 
-def test_hold_is_full_at_change_points_and_fades_without_a_corner() -> None:
-    """From a cubic: its slope is no more than 1.5 / width, the change of that 6 / width^2."""
+def test_hold_is_full_at_change_points_and_decreases_smoothly() -> None:
+    """The hold is a cubic with a slope of at most 1.5 / width and a curvature of 6 / width^2."""
     theta = np.linspace(-pi, 2.0 * pi, 30_001)
     hold, sizes = np.array([hold_on_branch(angle) for angle in theta]), np.abs(np.sin(theta))
     assert (hold[sizes <= HOLD_FADES_FROM] == 1.0).all()
@@ -285,7 +285,7 @@ def demand_of(axes: Axes, errors: Array, acceleration: Array = NONE[:2], band: f
 
 @pytest.fixture(params=SEEDS)
 def random_axes(request: pytest.FixtureRequest, uneven: Mechanism) -> Axes:
-    """Take the linkage in some pose, at rest: without b."""
+    """Evaluate the linkage in a random pose at rest, where b = 0."""
     rng = np.random.default_rng(request.param)
     return axes_at(uneven, assemble(uneven, 0.1, 0.1 + rng.uniform(0.9, 2.0)), NONE, False)
 
@@ -295,7 +295,7 @@ def acceleration_of(axes: Axes, demand: Array) -> Array:
     return found
 
 
-def test_links_accelerate_as_the_law_says(random_axes: Axes) -> None:
+def test_links_accelerate_according_to_the_law(random_axes: Axes) -> None:
     errors, planned = np.array([[0.01, -0.03], [0.2, 0.1]]), np.array([0.5, -0.7])
     demand = demand_of(random_axes, errors, planned, band=0.01)
     np.testing.assert_allclose(
@@ -304,23 +304,23 @@ def test_links_accelerate_as_the_law_says(random_axes: Axes) -> None:
 
 
 @pytest.mark.parametrize('sticking', [0.0, 0.3, 1.0])
-def test_attitude_errors_act_whatever_sticks(sticking: float, random_axes: Axes) -> None:
-    """All links off by the same angle: nothing turns in the joints, so no band applies."""
+def test_attitude_errors_act_at_any_friction_band(sticking: float, random_axes: Axes) -> None:
+    """Equal errors of all links turn no joint, so no band applies."""
     errors = np.array([[1e-4, 1e-4], [0.0, 0.0]])
     demand = demand_of(random_axes, errors, band=0.05, sticking=sticking)
     np.testing.assert_allclose(acceleration_of(random_axes, demand), 16.0 * 1e-4, rtol=1e-10)
 
 
 def configuration_error(axes: Axes, theta: float) -> Array:
-    """Turn the joints only: without angular momentum about the whole."""
+    """Return errors that turn the joints without angular momentum of the whole."""
     first, second = axes.matrix.sum(axis=0) / axes.matrix.sum()
     return np.array([[-second * theta, first * theta], [0.0, 0.0]])
 
 
 @pytest.mark.parametrize('theta', [0.0, 3e-4, -5e-4, 8e-4, -0.01])
-def test_configuration_errors_within_the_band_do_nothing_at_rest(theta: float, random_axes: Axes
-                                                                 ) -> None:
-    """Beyond it they act from zero on: what a law without band does for the error less it."""
+def test_configuration_errors_within_the_band_have_no_effect(theta: float, random_axes: Axes
+                                                             ) -> None:
+    """Beyond the band the law acts on the error minus the band."""
     band = 5e-4
     demand = demand_of(random_axes, configuration_error(random_axes, theta), band=band,
                        sticking=1.0)
@@ -333,15 +333,15 @@ def test_configuration_errors_within_the_band_do_nothing_at_rest(theta: float, r
         moving, demand_of(random_axes, configuration_error(random_axes, theta)))
 
 
-def test_disturbance_is_taken_off_in_motion(random_axes: Axes) -> None:
-    """The wheels give what is missing: links accelerate as without it."""
+def test_disturbance_is_compensated_in_motion(random_axes: Axes) -> None:
+    """The links accelerate as without the disturbance."""
     pushed = np.array([3e-6, -5e-6])
     np.testing.assert_allclose(
         demand_of(random_axes, np.zeros((2, 2)), disturbance=pushed)[:2], -pushed, rtol=1e-12)
 
 
-def test_at_rest_only_what_turns_the_whole_is_taken_off(random_axes: Axes) -> None:
-    """Friction in the joints is torque between the links: it sums up to nothing."""
+def test_at_rest_only_torque_on_the_whole_is_compensated(random_axes: Axes) -> None:
+    """Joint friction acts between the links, so its sum over the links is zero."""
     still = np.zeros((2, 2))
     pushed = np.array([3e-6, -5e-6])
     demand = demand_of(random_axes, still, disturbance=pushed, sticking=1.0)
@@ -349,5 +349,5 @@ def test_at_rest_only_what_turns_the_whole_is_taken_off(random_axes: Axes) -> No
     turned = acceleration_of(random_axes, demand)
     assert turned[0] == pytest.approx(turned[1], rel=1e-10)
     between = demand_of(random_axes, still, disturbance=np.array([4e-6, -4e-6]), sticking=1.0)
-    # The difference of two almost equal torques.
+    # The tolerance is the rounding of a difference of almost equal torques.
     np.testing.assert_allclose(between, 0.0, atol=4e-6 * 1e-15)

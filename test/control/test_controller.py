@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the controller does before, while and after it may drive."""
+"""The controller: arming, moves, torques, costs, modes, commands, gains, refusals."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -47,14 +47,14 @@ def quarter_turn(driven: Any) -> None:
 
 
 def stronger(mechanism: Mechanism) -> Mechanism:
-    """Give a linkage motors that bear fast moves."""
+    """Return a linkage with motors for fast moves."""
     return replace(mechanism, motor_torque_limits=np.full(4, 1e-2),
                    motor_speed_limits=np.full(4, 5e4))
 
 
 # Arming
 
-def test_until_armed_it_follows_the_estimate_without_torque(paper: Mechanism) -> None:
+def test_disarmed_controller_follows_the_estimate_without_torque(paper: Mechanism) -> None:
     controller = Controller(paper, ControllerSettings())
     for n in range(5):
         angles = assemble(paper, 0.1 * n, 1.0 + 0.2 * n)
@@ -67,7 +67,7 @@ def test_until_armed_it_follows_the_estimate_without_torque(paper: Mechanism) ->
         np.testing.assert_array_equal(control.reference_angles, angles)
 
 
-def test_armed_it_holds_where_the_links_were(paper: Mechanism) -> None:
+def test_armed_controller_holds_the_present_angles(paper: Mechanism) -> None:
     controller = Controller(paper, ControllerSettings())
     held = assemble(paper, 0.0, 1.0)
     controller.tick(10 ** 9, assemble(paper, -1.0, 1.0), NONE, QUIET, NONE, NONE)
@@ -76,10 +76,10 @@ def test_armed_it_holds_where_the_links_were(paper: Mechanism) -> None:
     moved = assemble(paper, 0.1, 1.0)
     control = controller.tick(10 ** 9 + 2 * PERIOD_NS, moved, NONE, QUIET, NONE, NONE)
     assert controller.mode == 'hold'
-    # Opposite links exactly parallel: their mean, but for rounding.
+    # The reference of opposite links is their mean, within rounding.
     np.testing.assert_allclose(control.reference_angles, held, atol=1e-15)
     np.testing.assert_allclose(control.angle_errors, held - moved, atol=1e-15)
-    # The links shall turn back, so the wheels must turn on: their torque on the link is opposite.
+    # The torque on a link is opposite to that on its wheel.
     assert control.torques[0] > 0.0
 
 
@@ -121,7 +121,7 @@ def test_disarming_drops_the_goal(drive: Drive, refuses: Refuses) -> None:
 
 # Moving
 
-def test_move_ends_at_its_goal_in_time_and_keeps_it(drive: Drive, uneven: Mechanism) -> None:
+def test_move_ends_at_its_goal_in_time_and_holds_it(drive: Drive, uneven: Mechanism) -> None:
     driven = drive(stronger(uneven), 0.2, 1.5, setpoint_duration=2.0)
     quarter_turn(driven)
     goal = driven.controller.goal.copy()
@@ -144,13 +144,13 @@ def test_reference_rates_are_the_derivative_on_all_four_links(
     angles = np.array([control.reference_angles for control in controls])
     rates = np.array([control.reference_rates for control in controls])
     slopes = (angles[2:] - angles[:-2]) / (2.0 * PERIOD)
-    # Third derivatives up to 60 * 0.4 rad / (2 s)^3 * Gamma of 2, times (4 ms)^2 / 6.
+    # The third derivative is at most 60 * 0.4 rad / (2 s)^3 * Gamma of 2; times (4 ms)^2 / 6.
     np.testing.assert_allclose(slopes, rates[1:-1], atol=2 * 60 * 0.4 / 8 * PERIOD ** 2 / 6 * 2)
 
 
 @pytest.mark.parametrize('after', [1, 300, 1250, 2400])
 def test_replanning_takes_over_angle_rate_and_acceleration(after: int, drive: Drive) -> None:
-    """Up to the new setpoint and one tick beyond, the reference barely differs from the old."""
+    """One tick after the new setpoint the reference hardly differs from the old one."""
     old, new = drive(), drive()
     for driven in (old, new):
         quarter_turn(driven)
@@ -159,7 +159,7 @@ def test_replanning_takes_over_angle_rate_and_acceleration(after: int, drive: Dr
     np.testing.assert_array_equal(last_old.reference_angles, last_new.reference_angles)
     new.controller.setpoint(['link_a', 'link_b'], [-0.5, pi / 3 - 0.5])
     next_old, next_new = old.tick(), new.tick()
-    # Only the third derivative may jump: quintics of at most 3 rad over 10 s, jerk below
+    # Only the third derivative jumps. The quintics have at most 3 rad in 10 s and a jerk below
     # 60 * 3 * (rise + rate T + acceleration T^2, 6 rad) / T^3.
     jerk = 60.0 * 3.0 * 6.0 / 10.0 ** 3
     assert np.abs(next_new.reference_angles - next_old.reference_angles
@@ -203,7 +203,7 @@ def test_setpoint_with_a_foreign_stamp_is_refused(
 # Torques
 
 def pushed(mechanism: Mechanism, angles: Array, rates: Array) -> tuple[Controller, Array]:
-    """Return the torques of a controller that holds, after the links were pushed away."""
+    """Return the torques of a holding controller after a displacement of the links."""
     controller = Controller(mechanism, ControllerSettings())
     controller.device_armed(True)
     controller.tick(10 ** 9, assemble(mechanism, 0.0, 1.0), NONE, QUIET, NONE, NONE)
@@ -211,9 +211,9 @@ def pushed(mechanism: Mechanism, angles: Array, rates: Array) -> tuple[Controlle
     return controller, control.torques
 
 
-def test_at_its_goal_it_asks_for_nothing(paper: Mechanism) -> None:
+def test_torques_are_zero_at_the_goal(paper: Mechanism) -> None:
     controller, torques = pushed(paper, assemble(paper, 0.0, 1.0), NONE)
-    # Rounding of an angle of 1 rad, times bandwidth^2 and A of 1.44e-4 kg m^2.
+    # The tolerance is the rounding of 1 rad, times bandwidth^2 and A of 1.44e-4 kg m^2.
     assert np.abs(torques).max() < 2.2e-16 * 16.0 * 1.44e-4
     assert controller.saturated == 0
 
@@ -232,13 +232,13 @@ def test_saturation_scales_all_wheels_together(uneven: Mechanism) -> None:
 
 
 def near_change_point(name: str) -> tuple[Mechanism, Array]:
-    """Make a linkage, not on a parallelogram's branch, whose links c and d are almost in line."""
+    """Make a linkage off the parallelogram branch with links c and d almost in line."""
     same: Any = [0.02] * 4, [2.2e-5] * 4, [[0.05, 0.0]] * 4, [3.4e-7] * 4, [1e-2] * 4, [500.0] * 4
     if name == 'antiparallelogram':
         mechanism = Mechanism([0.12, 0.08, 0.12, 0.08], *same)  # type: ignore[arg-type]
         return mechanism, assemble(mechanism, 0.2, 0.2 + pi - 0.03, 'crossed')
     mechanism = Mechanism([0.12, 0.10, 0.09, 0.10], *same)  # type: ignore[arg-type]
-    # Links a and b span almost as much as c and d together.
+    # The distance of joints 2 and 4 is almost the sum of the lengths of c and d.
     gap, (a, b) = 0.19 - 1e-5, mechanism.link_lengths[:2]
     theta = np.arccos((a * a + b * b - gap * gap) / (2.0 * a * b))
     return mechanism, assemble(mechanism, 0.2, 0.2 + theta)
@@ -260,10 +260,10 @@ def test_at_a_change_point_off_the_parallelogram_the_wheels_coast(name: str) -> 
 
 @pytest.mark.parametrize('command', ['effort', 'velocity'])
 @pytest.mark.parametrize('theta', [0.0, 1e-3, -0.02, pi, pi - 0.03])
-def test_at_a_change_point_of_the_parallelogram_it_holds(
+def test_controller_holds_at_a_change_point_of_the_parallelogram(
     theta: float, command: str, steer: Drive, paper: Mechanism,
 ) -> None:
-    """Pushed off its branch by a step of the reference, the linkage comes back and stays."""
+    """After a step of the reference the linkage returns to its branch and stays."""
     steered = steer(paper, InitialState(0.1, 0.1 + theta + 0.05), armed=False, command=command,
                     change_points='keep')
     steered.controller.device_armed(True)
@@ -277,10 +277,10 @@ def test_at_a_change_point_of_the_parallelogram_it_holds(
     assert not steered.controller.wheels.faults()
 
 
-# Accounts
+# Actuation cost
 
-def test_energy_and_the_two_accounts_of_effort(drive: Drive, paper: Mechanism) -> None:
-    """Constant speeds and torques for a second: sums become products."""
+def test_energy_and_the_two_sums_of_actuation_cost(drive: Drive, paper: Mechanism) -> None:
+    """With constant speeds and torques for a second the sums are products."""
     controller = Controller(paper, ControllerSettings())
     angles = assemble(paper, 0.0, 1.0)
     rates, speeds = np.array([0.5, 0.0, 0.5, 0.0]), np.array([20.0, -30.0, 40.0, 0.0])
@@ -303,7 +303,7 @@ def test_energy_and_the_two_accounts_of_effort(drive: Drive, paper: Mechanism) -
 
 
 def test_copper_loss_is_resistance_times_current_squared(prototype: Mechanism) -> None:
-    """For a second, with what the file says: 0.03 N m/A and 1 ohm."""
+    """The motors of the file have 0.03 N m/A and 1 ohm; the duration is a second."""
     controller = Controller(prototype, ControllerSettings())
     angles = assemble(prototype, 0.0, 1.0)
     controller.device_armed(True)
@@ -317,7 +317,7 @@ def test_copper_loss_is_resistance_times_current_squared(prototype: Mechanism) -
 
 @pytest.fixture
 def moving(steer: Drive, prototype: Mechanism) -> Any:
-    """Give the bench-scale linkage in the middle of a move."""
+    """Return the bench-scale linkage in the middle of a move."""
     steered = steer(prototype, setpoint_duration=4.0)
     steered.controller.setpoint(['link_a', 'link_b'], [0.8, pi / 3 + 0.5])
     steered.ticks(500)
@@ -326,7 +326,7 @@ def moving(steer: Drive, prototype: Mechanism) -> Any:
 
 
 def settle(steered: Any, seconds: float = 4.0) -> None:
-    """Let it come to rest: more than ten time constants of the law."""
+    """Advance by more than ten time constants of the law."""
     steered.ticks(round(seconds / PERIOD))
 
 
@@ -335,7 +335,7 @@ def rates_of(steered: Any) -> Array:
     return rates
 
 
-def test_idle_leaves_the_wheels_alone(moving: Any) -> None:
+def test_idle_controller_gives_no_torque(moving: Any) -> None:
     moving.controller.enable(False)
     assert moving.controller.mode == 'track'
     controls = moving.ticks(50)
@@ -347,14 +347,14 @@ def test_idle_leaves_the_wheels_alone(moving: Any) -> None:
         assert control.command.powered.all()
         assert not control.angle_errors.any()
     assert moving.controller.goal is None
-    # It drifts on: nothing drives and nothing brakes it.
+    # The linkage drifts without a driving or a braking torque.
     assert np.abs(rates_of(moving)).min() > 0.1
 
 
 @pytest.mark.parametrize('act', ['setpoint', 'trajectory', 'hold', 'damp'])
 @pytest.mark.parametrize(('state', 'reason'), [
     ('disarmed', 'armed'), ('idle', 'enabled')])
-def test_nothing_is_done_while_it_may_not_drive(
+def test_requests_are_refused_while_disarmed_or_idle(
     act: str, state: str, reason: str, steer: Drive, prototype: Mechanism,
 ) -> None:
     steered = steer(prototype, armed=state != 'disarmed')
@@ -376,7 +376,7 @@ def test_nothing_is_done_while_it_may_not_drive(
     assert (controller.mode, controller.goal) == (state, None)
 
 
-def test_enabled_again_it_stops_links_that_move_and_holds_them(moving: Any) -> None:
+def test_controller_enabled_again_stops_moving_links_and_holds(moving: Any) -> None:
     controller = moving.controller
     controller.enable(False)
     moving.ticks(50)
@@ -384,8 +384,8 @@ def test_enabled_again_it_stops_links_that_move_and_holds_them(moving: Any) -> N
     controller.enable(True)
     first = moving.tick()
     assert controller.mode == 'hold'
-    # It begins with what they have: no error, and no torque but what it takes to go on so.
-    # In a period a stop within a second, of 0.5 rad/s, changes them by 60 * 0.5 T^2 / 2 at most.
+    # The reference begins with the angles and rates of the links. A stop from 0.5 rad/s within a
+    # second changes the rates in a period by at most 60 * 0.5 T^2 / 2.
     np.testing.assert_allclose(first.reference_rates, before, atol=15.0 * PERIOD ** 2)
     np.testing.assert_allclose(first.angle_errors, 0.0, atol=1e-3)
     settle(moving)
@@ -393,7 +393,7 @@ def test_enabled_again_it_stops_links_that_move_and_holds_them(moving: Any) -> N
     assert controller.mode == 'hold'
 
 
-def test_hold_gives_the_move_up_and_stays(moving: Any) -> None:
+def test_hold_ends_the_move_and_stays(moving: Any) -> None:
     controller = moving.controller
     controller.hold()
     assert (controller.mode, controller.goal) == ('hold', None)
@@ -402,11 +402,11 @@ def test_hold_gives_the_move_up_and_stays(moving: Any) -> None:
     settle(moving)
     np.testing.assert_array_equal(moving.tick().reference_angles, held)
     np.testing.assert_allclose(moving.plant.truth().link_angles, held, atol=1e-4)
-    # Not where it was going: given up.
+    # The reference is not at the goal of the move.
     assert np.abs(held[:2] - [0.8, pi / 3 + 0.5]).max() > 0.05
 
 
-def test_damp_stops_all_rates_wherever_that_ends(moving: Any) -> None:
+def test_damp_stops_all_rates_at_any_angles(moving: Any) -> None:
     controller = moving.controller
     controller.damp()
     assert (controller.mode, controller.goal) == ('damp', None)
@@ -416,7 +416,7 @@ def test_damp_stops_all_rates_wherever_that_ends(moving: Any) -> None:
         assert not control.angle_errors.any()
         assert not control.reference_rates.any()
         rates = rates_of(moving)
-        # A rhombus: A is constant, so every rate falls off by itself, 2 * 0.9 * 4 per second.
+        # A is constant for a rhombus, so every rate decays independently at 2 * 0.9 * 4 /s.
         assert (np.abs(rates) <= np.abs(last) + 1e-6).all()
         last = rates
     assert controller.mode == 'damp'
@@ -435,15 +435,15 @@ STEPS: dict[str, Callable[[Any], None]] = {
 @pytest.mark.parametrize('command', ['effort', 'velocity'])
 @pytest.mark.parametrize('second', [*STEPS])
 @pytest.mark.parametrize('first', [*STEPS])
-def test_any_mode_follows_any_other_without_a_blow(
+def test_change_of_mode_causes_no_large_torque_step(
     first: str, second: str, command: str, steer: Drive, prototype: Mechanism, refuses: Refuses,
 ) -> None:
     """
-    The torque never jumps by more than what it takes to brake the links that move, and it ends.
+    Steps of the torque are at most those of braking moving links, and the torque ends.
 
-    Links turn at 0.5 rad/s at most, with A below 0.05 kg m^2 and 7.2 /s of damping, shared by two
-    wheels; besides, a reference at rest may be left behind by 0.05 rad, and the plan have its
-    own acceleration of 1 rad/s^2.
+    Links turn at 0.5 rad/s at most, A is below 0.05 kg m^2, the damping is 7.2 /s, and two wheels
+    share the torque. A reference at rest may be 0.05 rad away, and the plan may accelerate at
+    1 rad/s^2.
     """
     steered = steer(prototype, setpoint_duration=4.0, command=command)
     STEPS['track'](steered)
@@ -470,13 +470,13 @@ def test_any_mode_follows_any_other_without_a_blow(
 
 
 @pytest.mark.parametrize('act', ['setpoint', 'trajectory'])
-def test_setpoint_while_damping_starts_from_the_links_as_they_move(act: str, moving: Any) -> None:
+def test_setpoint_while_damping_starts_from_the_moving_links(act: str, moving: Any) -> None:
     controller = moving.controller
     controller.damp()
     before = moving.ticks(5)[-1]
     rates, angles = rates_of(moving), moving.plant.truth().link_angles
     assert np.abs(rates).max() > 0.1
-    # The tick that the setpoint follows saw them a period ago.
+    # The last tick before the setpoint is a period ago.
     seen = controller.rates.copy()
     goal = [0.8, pi / 3 + 0.5]
     if act == 'setpoint':
@@ -486,7 +486,7 @@ def test_setpoint_while_damping_starts_from_the_links_as_they_move(act: str, mov
     assert controller.mode == 'track'
     control = moving.tick()
     assert not before.reference_rates.any()
-    # One period on, the quintic has changed its rate by no more than its largest acceleration.
+    # In one period the rate of the quintic changes by at most its largest acceleration times T.
     np.testing.assert_allclose(control.reference_rates, seen, atol=PERIOD * 1.0)
     np.testing.assert_allclose(control.reference_angles, angles, atol=PERIOD * 0.5 * PERIOD + 2e-4)
     settle(moving, 6.0)
@@ -494,9 +494,9 @@ def test_setpoint_while_damping_starts_from_the_links_as_they_move(act: str, mov
 
 
 @pytest.mark.parametrize('act', ['setpoint', 'trajectory'])
-def test_refusal_while_damping_changes_nothing(act: str, steer: Drive, prototype: Mechanism
-                                               ) -> None:
-    """The next commands are those of a controller that was not asked."""
+def test_refusal_while_damping_has_no_effect(act: str, steer: Drive, prototype: Mechanism
+                                             ) -> None:
+    """The next commands equal those of a controller without the refused request."""
     alone, bothered = (steer(prototype, setpoint_duration=4.0) for _ in range(2))
     for steered in (alone, bothered):
         STEPS['track'](steered)
@@ -515,8 +515,8 @@ def test_refusal_while_damping_changes_nothing(act: str, steer: Drive, prototype
         np.testing.assert_array_equal(first.reference_angles, second.reference_angles)
 
 
-def test_repeated_tick_answers_the_same(moving: Any) -> None:
-    """A lock-step sends it again when its answer was lost, perhaps with other numbers."""
+def test_repeated_tick_has_the_same_answer(moving: Any) -> None:
+    """Lock-step repeats a tick after a lost answer, perhaps with other numbers."""
     control = moving.tick()
     saturated, drift = moving.controller.saturated, moving.controller.momentum.drift.copy()
     truth = moving.plant.truth()
@@ -529,8 +529,8 @@ def test_repeated_tick_answers_the_same(moving: Any) -> None:
     assert moving.tick() is not control
 
 
-def test_answers_are_not_written_anew(moving: Any) -> None:
-    """What a tick returned stays as it was."""
+def test_answers_are_not_overwritten(moving: Any) -> None:
+    """The result of a tick does not change at later ticks."""
     control = moving.tick()
     kept = {name: np.array(getattr(control, name)) for name in (
         'torques', 'reference_angles', 'reference_rates', 'angle_errors', 'rate_errors',
@@ -544,9 +544,9 @@ def test_answers_are_not_written_anew(moving: Any) -> None:
 
 # Commands
 
-def test_by_speed_wheels_are_told_speeds_and_links_move_the_same(steer: Drive,
-                                                                 prototype: Mechanism) -> None:
-    """Motors that follow torques and motors that follow speeds end at the same place."""
+def test_speed_commands_move_the_links_as_torque_commands_do(steer: Drive,
+                                                             prototype: Mechanism) -> None:
+    """The final angles agree for both kinds of command."""
     ends = []
     for command in ('effort', 'velocity'):
         steered = steer(prototype, setpoint_duration=2.0, command=command)
@@ -558,15 +558,15 @@ def test_by_speed_wheels_are_told_speeds_and_links_move_the_same(steer: Drive,
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-4)
 
 
-def test_command_can_be_changed_on_the_way(moving: Any) -> None:
-    """From torques to speeds and back, bumpless: half of what the move itself changes them by."""
+def test_command_can_be_changed_during_a_move(moving: Any) -> None:
+    """Changes from torques to speeds and back are bumpless."""
     controller, settings = moving.controller, moving.controller.settings
     errors = []
     for command in ('velocity', 'effort'):
         controller.tune(replace(settings, command=command))
         errors += [control.angle_errors for control in moving.ticks(100)]
         assert controller.mode == 'track'
-    # Without a change it is below 2e-3 rad: a motor's lag and a tick late.
+    # Without a change the error is below 2e-3 rad, due to the motor lag and the delay of a tick.
     assert np.abs(errors).max() < 4e-3
     assert not controller.wheels.faults()
 
@@ -576,10 +576,10 @@ def test_command_can_be_changed_on_the_way(moving: Any) -> None:
 UNSTABLE = {'bandwidth': 20.0, 'damping': 2.0}
 
 
-def test_gains_that_are_unstable_at_this_rate_are_refused(
+def test_unstable_gains_at_the_present_rate_are_refused(
     drive: Drive, refuses: Refuses,
 ) -> None:
-    """At 50 Hz, seen from the stamps; nothing changes."""
+    """The stamps have 50 Hz; a refusal has no effect."""
     driven = drive(armed=False)
     controller = driven.controller
     before = controller.settings
@@ -592,7 +592,7 @@ def test_gains_that_are_unstable_at_this_rate_are_refused(
     assert controller.settings.bandwidth == 3.0
 
 
-def test_unknown_allocation_is_refused_and_changes_nothing(
+def test_unknown_allocation_is_refused_and_has_no_effect(
     drive: Drive, refuses: Refuses,
 ) -> None:
     controller = drive().controller
@@ -602,10 +602,10 @@ def test_unknown_allocation_is_refused_and_changes_nothing(
     assert controller.settings is before
 
 
-def test_gains_too_fast_for_the_rate_that_comes_are_not_driven(
+def test_controller_is_idle_with_gains_too_fast_for_the_rate(
     paper: Mechanism, refuses: Refuses,
 ) -> None:
-    """Before the first two ticks the rate is unknown; then it idles, says why, and can be told."""
+    """The rate is known after two ticks; then the controller idles until the gains are changed."""
     settings = ControllerSettings(**UNSTABLE)  # type: ignore[arg-type]
     controller = Controller(paper, settings)
     controller.device_armed(True)
@@ -630,8 +630,8 @@ def test_gains_too_fast_for_the_rate_that_comes_are_not_driven(
     assert controller.mode == 'track'
 
 
-def test_rate_that_falls_makes_it_idle(paper: Mechanism) -> None:
-    """At 250 Hz they are stable, at 50 not."""
+def test_controller_becomes_idle_when_the_rate_falls(paper: Mechanism) -> None:
+    """The gains are stable at 250 Hz and unstable at 50 Hz."""
     settings = ControllerSettings(**UNSTABLE)  # type: ignore[arg-type]
     controller = Controller(paper, settings)
     controller.device_armed(True)
@@ -640,7 +640,7 @@ def test_rate_that_falls_makes_it_idle(paper: Mechanism) -> None:
         stamp += PERIOD_NS
         controller.tick(stamp, angles, NONE, QUIET, NONE, NONE)
     assert controller.mode == 'hold'
-    # A tick or two that got lost make no new rate.
+    # One or two lost ticks do not change the rate.
     for lost in (2, 3):
         stamp += lost * PERIOD_NS
         controller.tick(stamp, angles, NONE, QUIET, NONE, NONE)
@@ -656,8 +656,8 @@ def test_rate_that_falls_makes_it_idle(paper: Mechanism) -> None:
 
 
 @pytest.mark.parametrize('times', [5, 13])
-def test_rate_that_falls_to_a_whole_fraction_is_noticed_too(times: int, paper: Mechanism) -> None:
-    """Not at once, when it might be lost ticks; and some lost every now and then are no rate."""
+def test_rate_that_falls_to_a_whole_fraction_is_detected(times: int, paper: Mechanism) -> None:
+    """Detection takes several ticks, since single gaps may be lost ticks."""
     settings = ControllerSettings(**UNSTABLE)  # type: ignore[arg-type]
     controller = Controller(paper, settings)
     controller.device_armed(True)
@@ -677,9 +677,9 @@ def test_rate_that_falls_to_a_whole_fraction_is_noticed_too(times: int, paper: M
     assert f'{250.0 / times:.4g} Hz' in controller.problem
 
 
-# What is asked for
+# Setpoints and trajectories
 
-def test_more_than_the_wheels_bear_is_refused_with_the_shortest_duration(drive: Drive) -> None:
+def test_demand_beyond_the_limits_is_refused_with_the_shortest_duration(drive: Drive) -> None:
     driven = drive(setpoint_duration=1.0)
     with pytest.raises(SetpointError) as caught:
         quarter_turn(driven)
@@ -695,10 +695,10 @@ def test_more_than_the_wheels_bear_is_refused_with_the_shortest_duration(drive: 
 
 
 @pytest.mark.parametrize('linkage', ['paper', 'prototype'])
-def test_shortest_timing_takes_as_long_as_the_wheels_need(
+def test_shortest_timing_has_the_shortest_feasible_duration(
     linkage: str, steer: Drive, request: pytest.FixtureRequest,
 ) -> None:
-    """Whatever the duration is set to: as the refusal of a shorter one says."""
+    """The duration of the setting has no effect; a refusal reports the shortest duration."""
     mechanism = request.getfixturevalue(linkage)
     goal = [pi / 2, pi / 3 + pi / 2]
     refused = steer(mechanism, setpoint_duration=1.0)
@@ -710,16 +710,16 @@ def test_shortest_timing_takes_as_long_as_the_wheels_need(
     errors = []
     while steered.controller.mode == 'track':
         errors.append(steered.tick().angle_errors)
-    # Told in hundredths, rounded up; ends with the first tick after it.
+    # The message rounds the duration up to 0.01 s, and the move ends at the next tick.
     assert shortest - 0.01 - PERIOD <= len(errors) * PERIOD <= shortest + PERIOD
-    # The links come along: a motor's lag of 3 ms and half a tick, at 7 rad/s^2 at most, lets the
-    # law be behind by lag times acceleration over its stiffness.
+    # The error is the delay (motor lag of 3 ms and half a tick) times the acceleration of at most
+    # 7 rad/s^2, over the stiffness of the law.
     assert np.abs(errors).max() < 3e-3
     settle(steered)
     np.testing.assert_allclose(steered.plant.truth().link_angles[:2], goal, atol=1e-5)
 
 
-def test_trajectory_goes_through_its_points_in_time(drive: Drive) -> None:
+def test_trajectory_passes_its_points_in_time(drive: Drive) -> None:
     driven = drive()
     points = [Point([0.1, pi / 3 + 0.05], 4.0), Point([0.1, pi / 3 - 0.05], 8.0),
               Point([0.3, pi / 3], 14.0)]
@@ -743,7 +743,7 @@ def test_trajectory_goes_through_its_points_in_time(drive: Drive) -> None:
     (['link_a'], [Point([0.1], 5.0), Point([0.2], 4.0)], {'point': 2, 'name': 'time'}),
     (['link_a', 'link_b'], [Point([pi / 2, pi], 0.5)], {'name': 'flywheel_b'}),
     (['link_b'], [Point([0.0], 10.0)], {'name': 'change_point'})])
-def test_trajectory_is_refused_whole(
+def test_trajectory_is_refused_as_a_whole(
     names: list[str], points: list[Point], values: dict[str, Any], drive: Drive,
 ) -> None:
     driven = drive()
@@ -767,8 +767,8 @@ def test_trajectory_with_a_foreign_stamp_is_refused(
             ['link_a'], [Point([0.1], 5.0)], driven.stamp_ns + round(offset_s * 1e9))
 
 
-def test_change_points_are_avoided_or_kept(drive: Drive, refuses: Refuses) -> None:
-    """To the other side of theta = 0, or to rest on it: only where it may cross."""
+def test_change_points_need_the_setting_keep(drive: Drive, refuses: Refuses) -> None:
+    """The goals are beyond theta = 0 and on it."""
     for goal in (-0.3, 0.0):
         avoiding = drive(phi_b=0.3)
         with refuses(SetpointError, name='change_point'):
@@ -782,7 +782,7 @@ def test_change_points_are_avoided_or_kept(drive: Drive, refuses: Refuses) -> No
 
 
 @pytest.mark.parametrize('command', ['effort', 'velocity'])
-def test_it_crosses_a_change_point_on_its_branch(
+def test_move_crosses_a_change_point_on_its_branch(
     command: str, steer: Drive, prototype: Mechanism,
 ) -> None:
     steered = steer(prototype, InitialState(0.1, 0.5), setpoint_duration=3.0, command=command,

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The table of parameters and the settings are the same thing."""
+"""The table of parameters agrees with the settings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_rows_are_the_fields_of_the_settings_in_order() -> None:
 
 
 @each_row
-def test_defaults_are_those_of_the_settings_and_are_allowed(row: Setting) -> None:
+def test_defaults_are_those_of_the_settings_and_are_valid(row: Setting) -> None:
     assert row.default == getattr(ControllerSettings(), row.name)
     assert (row.limits is None) != (row.choices is None)
     if row.limits is not None:
@@ -33,7 +33,7 @@ def test_defaults_are_those_of_the_settings_and_are_allowed(row: Setting) -> Non
 
 
 @each_row
-def test_everything_can_be_set_while_it_runs_and_says_what_it_is(row: Setting) -> None:
+def test_every_parameter_can_be_set_at_run_time_and_is_described(row: Setting) -> None:
     assert row.live
     assert row.meaning
     assert not row.meaning.endswith('.')
@@ -42,7 +42,7 @@ def test_everything_can_be_set_while_it_runs_and_says_what_it_is(row: Setting) -
 @pytest.mark.parametrize(('row', 'choice'), [
     (row, choice) for row in SETTINGS for choice in row.choices or ()],
     ids=[f'{row.name}-{choice}' for row in SETTINGS for choice in row.choices or ()])
-def test_every_choice_is_one_that_the_controller_takes(
+def test_controller_accepts_every_choice(
     row: Setting, choice: str, prototype: Mechanism,
 ) -> None:
     controller = Controller(prototype, ControllerSettings())
@@ -50,5 +50,5 @@ def test_every_choice_is_one_that_the_controller_takes(
     assert getattr(controller.settings, row.name) == choice
 
 
-def test_wheels_may_be_left_free() -> None:
+def test_null_space_target_may_be_free() -> None:
     assert WHEEL_TARGETS[0] == ControllerSettings().wheel_target == 'free'

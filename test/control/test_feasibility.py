@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a motion needs of the wheels is what the plant takes, and limits are told with numbers."""
+"""Demands of a motion on the wheels: agreement with the plant, and errors with the limits."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -57,14 +57,14 @@ def prototype() -> Mechanism:
 
 @pytest.fixture(scope='module')
 def parallelogram() -> Mechanism:
-    """Make a parallelogram with nothing equal but opposite lengths."""
+    """Make a parallelogram whose only equal parameters are opposite lengths."""
     return Mechanism(  # type: ignore[arg-type]
         [0.12, 0.08, 0.12, 0.08], [0.02, 0.03, 0.025, 0.018], [2.2e-5, 1.5e-5, 3e-5, 1.8e-5],
         [[0.05, 0.01], [0.04, -0.01], [0.06, 0.005], [0.05, 0.0]], [3e-7, 4e-7, 5e-7, 2e-7])
 
 
 def squares(mechanism: Mechanism, *usable: int) -> Allocation:
-    """Weight as paper eq. 8, with some wheels only."""
+    """Return the allocation of paper eq. 8 with the usable wheels."""
     return make_allocation('min_norm', mechanism.flywheel_inertias, np.isin(range(4), usable))
 
 
@@ -96,26 +96,27 @@ def loads(mechanism: Mechanism, segment: TrajectorySegment, wheels: Wheels, time
     return path.angles, torques, wheels.speeds + gained
 
 
-# What the paper says
+# Values of the paper
 
 @pytest.mark.parametrize(('usable', 'absolute'), [((0, 1, 2, 3), 62.37), ((0, 1), 124.74)])
 def test_quarter_turn_of_the_paper(
     usable: tuple[int, ...], absolute: float, paper: Mechanism,
 ) -> None:
-    """Absolute speeds; a wheel runs against its link, so relative to it the peak rate more."""
+    """Values are absolute; relative to the link the speed is larger by the rate of the link."""
     segment = quarter_turn(10.0)
     needs = needs_of(paper, segment, present_at(paper, segment), fresh(paper, *usable))
     relative = absolute + PEAK_RATE * pi / 2 / 10.0
-    # The trapezoid in 200 parts of a sine, almost: (2 pi / 200)^2 / 12 = 8e-5; and two digits.
+    # The error of the trapezoidal rule with 200 intervals is (2 pi / 200)^2 / 12 = 8e-5; the
+    # expected values have two decimals.
     np.testing.assert_allclose(
         needs.peak_speeds[list(usable)], relative, rtol=1.5e-4, atol=0.005)
-    # What is not used is carried along by its link.
+    # A wheel without torque keeps its absolute speed of zero.
     np.testing.assert_allclose(
         np.delete(needs.peak_speeds, usable), PEAK_RATE * pi / 2 / 10.0, rtol=1e-3)
     assert not np.delete(needs.peak_torques, usable).any()
 
 
-# What the plant says
+# Agreement with the plant
 
 WAYS = [
     ('paper', step(0.0, pi / 3, 1.0, 0.2, 4.0)),
@@ -129,7 +130,7 @@ WAYS = [
 
 @pytest.mark.parametrize(('linkage', 'segment'), WAYS)
 @pytest.mark.parametrize('usable', [(0, 1, 2, 3), (0, 1), (0, 1, 3), (1, 2)])
-def test_plant_given_the_torques_moves_so_and_its_wheels_reach_these_speeds(
+def test_motion_and_wheel_speeds_of_the_plant_under_the_torques(
     linkage: str, segment: SoftStep, usable: tuple[int, ...], request: pytest.FixtureRequest,
 ) -> None:
     mechanism = replace(request.getfixturevalue(linkage), motor_torque_limits=UNLIMITED,
@@ -144,7 +145,7 @@ def test_plant_given_the_torques_moves_so_and_its_wheels_reach_these_speeds(
     for torque in torques:
         plant.advance(1, torque)
         peaks = np.maximum(peaks, np.abs(plant.truth().wheel_speeds))
-    # Without feedback: torques at midpoints leave some (STEP / duration)^2 of the way.
+    # There is no feedback; torques at midpoints cause errors of about (STEP / duration)^2.
     np.testing.assert_allclose(plant.truth().link_angles[:2], segment.goal, atol=1e-4)
     needs = needs_of(mechanism, segment, present_at(mechanism, segment), wheels)
     np.testing.assert_allclose(needs.peak_speeds, peaks, rtol=5e-3, atol=1e-3)
@@ -155,10 +156,10 @@ def test_plant_given_the_torques_moves_so_and_its_wheels_reach_these_speeds(
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_momentum_is_only_moved(
+def test_momentum_of_links_moves_to_the_wheels(
     seed: int, uneven: Mechanism, parallelogram: Mechanism,
 ) -> None:
-    """From motion to rest all that the links had is in the wheels."""
+    """At rest the wheels have all initial momentum of the links."""
     rng = np.random.default_rng(seed)
     for mechanism in (uneven, parallelogram):
         start = np.array([[0.2, 1.5], rng.uniform(-0.2, 0.2, 2), rng.uniform(-0.1, 0.1, 2)])
@@ -170,19 +171,19 @@ def test_momentum_is_only_moved(
         before = angular_momentum(mechanism, present, rates, wheels.speeds + rates)
         needs = needs_of(mechanism, segment, present, wheels)
         after = float(mechanism.flywheel_inertias @ needs.end_speeds)
-        # The trapezoid at 200 instants is good to 1e-4 of what passes through the wheels.
+        # The trapezoidal rule with 200 instants has an error of 1e-4 of the exchanged momentum.
         passed = float(mechanism.flywheel_inertias @ needs.peak_speeds)
         assert abs(after - before) < 1e-4 * passed, f'seed {seed}'
 
 
-# Sharing
+# Allocation
 
 @pytest.mark.parametrize('seed', range(20))
 @pytest.mark.parametrize('linkage', ['uneven', 'parallelogram'])
-def test_shares_meet_the_demand_with_the_smallest_weighted_norm(
+def test_torques_meet_the_demand_with_the_smallest_weighted_norm(
     seed: int, linkage: str, request: pytest.FixtureRequest,
 ) -> None:
-    """Paper eq. 6 holds at every instant, and no other torques that meet it are smaller."""
+    """Torques meet paper eq. 6 at every instant, and the gradient of the norm is zero."""
     mechanism = request.getfixturevalue(linkage)
     rng = np.random.default_rng(seed)
     wheels = Wheels(np.zeros(4), WeightedNorm(rng.uniform(0.1, 2.0, 4)))
@@ -192,19 +193,19 @@ def test_shares_meet_the_demand_with_the_smallest_weighted_norm(
     for pose, torque, (_, rate, acceleration) in zip(angles, torques, segment.sample(times)):
         form = reduced_form(mechanism, pose, rate)
         demand = form.mass_matrix @ acceleration + form.bias
-        # The condition of G and A times some roundings.
+        # The tolerance is the condition of G and A times some roundings.
         np.testing.assert_allclose(
             -form.wheel_map @ torque, demand, atol=1e-12 * np.abs(demand).max() + 1e-20,
             err_msg=f'seed {seed}')
-        # At the optimum the gradient tau / V is perpendicular to all that changes nothing.
+        # At the optimum the gradient tau / V is orthogonal to the null space.
         slope = null_space(form.wheel_map).T @ (torque / wheels.allocation.weights_inv)
         assert np.abs(slope).max() <= 1e-11 * np.abs(torque / wheels.allocation.weights_inv).max()
 
 
-def test_wheels_of_one_pair_can_turn_this_pair_only(
+def test_wheels_of_one_pair_turn_only_this_pair(
     paper: Mechanism, refuses: Refuses,
 ) -> None:
-    """On the rhombus links a and c are on their own: A is diagonal and b is 0."""
+    """The pairs of a rhombus are independent: A is diagonal and b is 0."""
     turn_a, turn_b = step(0.0, 1.2, 0.4, 0.0, 4.0), step(0.0, 1.2, 0.0, 0.4, 4.0)
     present, wheels = present_at(paper, turn_a), fresh(paper, 0, 2)
     needs = check_needs(paper, turn_a, present, wheels)
@@ -241,15 +242,15 @@ def test_refused_with_wheel_numbers_and_shortest_duration(
     assert error.values['value'] == pytest.approx(value, rel=4e-4)
     assert error.values['limit'] == pytest.approx(0.95 * given)
     shortest = error.values['duration']
-    for told in ('flywheel_b', f'{value:g} {unit}', f'{0.95 * given:g} {unit}', f'{shortest:g} s'):
-        assert told in str(error)
+    for part in ('flywheel_b', f'{value:g} {unit}', f'{0.95 * given:g} {unit}', f'{shortest:g} s'):
+        assert part in str(error)
     enough = quarter_turn(shortest)
     check_needs(weak, enough, present_at(weak, enough), fresh(weak))
     refusal(weak, quarter_turn(shortest - 0.03), fresh(weak))
 
 
 def fullness(mechanism: Mechanism, needs: Needs) -> float:
-    """Return the largest share of a limit that is needed."""
+    """Return the largest ratio of a demand to its limit."""
     return float(max((needs.peak_speeds / mechanism.motor_speed_limits).max(),
                      (needs.peak_torques / mechanism.motor_torque_limits).max(),
                      (needs.peak_voltages / mechanism.motor_voltages).max()))
@@ -263,7 +264,7 @@ CASES: list[tuple[str, float, tuple[float, float]]] = [
 
 @pytest.mark.parametrize(('linkage', 'speed', 'rates'), CASES)
 @pytest.mark.parametrize('share', [SHARE, 0.5])
-def test_at_the_shortest_duration_a_limit_is_met_and_below_it_is_broken(
+def test_shortest_duration_meets_a_limit_and_a_shorter_one_exceeds_it(
     linkage: str, speed: float, rates: tuple[float, float], share: float,
     request: pytest.FixtureRequest,
 ) -> None:
@@ -283,8 +284,8 @@ def test_at_the_shortest_duration_a_limit_is_met_and_below_it_is_broken(
     assert below > share
 
 
-def test_supply_covers_what_the_motors_of_the_plant_are_asked_for(prototype: Mechanism) -> None:
-    """The law of the plant: at the shortest duration it cuts nothing off, 2 % below it does."""
+def test_supply_limit_agrees_with_that_of_the_plant(prototype: Mechanism) -> None:
+    """The plant reduces no torque at the shortest duration, and does so 2 % below it."""
     weak = replace(prototype, motor_voltages=np.full(4, 3.0))
     motors = motors_of(weak)
     wheels = fresh(weak)
@@ -317,28 +318,28 @@ def test_stored_momentum_is_reported(prototype: Mechanism) -> None:
     assert str(caught.value) in str(error)
 
 
-def test_wheel_above_its_share_may_stay_and_slow_down(prototype: Mechanism) -> None:
+def test_wheel_above_its_limit_share_may_hold_or_slow_down(prototype: Mechanism) -> None:
     wheels = fresh(prototype, speeds=np.array([0.0, 290.0, 0.0, 0.0]))
     for segment in (step(0.0, 1.2, 0.0, 0.0, 5.0), step(0.0, 1.2, 0.0, 0.5, 10.0)):
         check_needs(prototype, segment, present_at(prototype, segment), wheels)
 
 
-def test_friction_comes_on_top(prototype: Mechanism, refuses: Refuses) -> None:
+def test_friction_is_added_to_the_torques(prototype: Mechanism, refuses: Refuses) -> None:
     friction = np.array([1e-3, 2e-3, 3e-3, 4e-3])
     turning = replace(fresh(prototype, speeds=np.array([50.0, -50.0, 50.0, -50.0])),
                       extra_torque=friction)
     hold, turn = step(0.0, 1.2, 0.0, 0.0, 5.0), quarter_turn(10.0)
     needs = needs_of(prototype, hold, present_at(prototype, hold), turning)
     np.testing.assert_allclose(needs.peak_torques, friction, rtol=1e-12)
-    # A wheel that turns faster and faster needs both in full.
+    # An accelerating wheel needs the sum of both.
     bare = needs_of(prototype, turn, present_at(prototype, turn), fresh(prototype))
     rubbing = needs_of(prototype, turn, present_at(prototype, turn),
                        replace(fresh(prototype), extra_torque=friction))
     np.testing.assert_allclose(
         rubbing.peak_torques, bare.peak_torques + friction, rtol=1e-12)
-    # An unusable wheel has no motor that could.
-    lame = replace(turning, allocation=squares(prototype, 0, 1))
-    needs = needs_of(prototype, hold, present_at(prototype, hold), lame)
+    # An unusable wheel has no motor torque against the friction.
+    three = replace(turning, allocation=squares(prototype, 0, 1))
+    needs = needs_of(prototype, hold, present_at(prototype, hold), three)
     assert not needs.peak_torques[2:].any()
     strong = replace(turning, extra_torque=np.full(4, 0.06))
     assert 'duration' not in refusal(prototype, turn, strong).values
@@ -346,14 +347,14 @@ def test_friction_comes_on_top(prototype: Mechanism, refuses: Refuses) -> None:
         shortest_duration(prototype, turn, present_at(prototype, turn), strong)
 
 
-def test_nothing_to_do_takes_the_least_duration(paper: Mechanism) -> None:
+def test_segment_without_motion_has_the_least_duration(paper: Mechanism) -> None:
     segment = step(0.0, 1.2, 0.0, 0.0, 1.0)
     assert shortest_duration(
         paper, segment, present_at(paper, segment), fresh(paper)) == LEAST_DURATION
 
 
 def test_trajectory_is_checked_like_a_step(paper: Mechanism) -> None:
-    """A trajectory of one point is that step; of several, only what it needs is told."""
+    """A trajectory of one point is a soft step; its error has no shortest duration."""
     segment = quarter_turn(10.0)
     present = present_at(paper, segment)
     trajectory, _ = read_trajectory(
@@ -370,7 +371,7 @@ def test_trajectory_is_checked_like_a_step(paper: Mechanism) -> None:
     assert 'duration' not in error.values
 
 
-def test_way_that_cannot_close_is_refused(refuses: Refuses) -> None:
+def test_path_that_cannot_close_is_refused(refuses: Refuses) -> None:
     long = Mechanism(  # type: ignore[arg-type]
         [0.3, 0.3, 0.2, 0.2], [0.02] * 4, [2e-5] * 4, [[0.05, 0.0]] * 4, [3e-7] * 4)
     segment = step(0.0, 1.0, 0.0, 1.5, 10.0)

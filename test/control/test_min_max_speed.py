@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The allocation `min_max_speed`: the fastest wheel is as slow as the demand and bounds admit."""
+"""The allocation `min_max_speed` minimises the largest wheel speed within the bounds."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ each_seed = pytest.mark.parametrize('seed', SEEDS)
 
 
 class Case:
-    """A random linkage, demand, bounds and wheel speeds; every third case has lost a wheel."""
+    """A random linkage, demand, bounds and wheel speeds; every third case lacks a wheel."""
 
     def __init__(self, mechanism: Mechanism, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -89,7 +89,7 @@ def test_demand_is_met_exactly_within_bounds(seed: int, uneven: Mechanism) -> No
 
 @each_seed
 def test_largest_speed_is_that_of_a_linear_program(seed: int, uneven: Mechanism) -> None:
-    """Wheels with little leverage are ignored, so it is larger by little, and never smaller."""
+    """The allocation ignores wheels with little leverage, so its speed is slightly larger."""
     case = Case(uneven, seed)
     fastest, least = case.fastest(case.solve()[0]), case.least()
     assert fastest >= least - 1e-6 * SPEED
@@ -98,7 +98,7 @@ def test_largest_speed_is_that_of_a_linear_program(seed: int, uneven: Mechanism)
 
 @each_seed
 def test_no_random_torques_that_meet_the_demand_are_better(seed: int, uneven: Mechanism) -> None:
-    """Twenty thousand from the null space, within the bounds."""
+    """The test draws 20000 torques from the null space within the bounds."""
     case = Case(uneven, seed)
     torques, _ = case.solve()
     free = null_space(case.wheel_map[:, case.usable])
@@ -113,7 +113,7 @@ def test_no_random_torques_that_meet_the_demand_are_better(seed: int, uneven: Me
 
 
 def test_wheels_of_a_pair_take_equal_speeds(paper: Mechanism) -> None:
-    """On the rhombus a and c are a pair: the difference of their speeds ends with the horizon."""
+    """Wheels a and c of the rhombus are a pair; their speeds are equal after the horizon."""
     wheel_map = reduced_form(paper, assemble(paper, 0.0, 1.0), np.zeros(2)).wheel_map
     limits, inertias = np.full(4, 1e-2), paper.flywheel_inertias
     torques, scale = make_allocation('min_max_speed', inertias, ALL).solve(
@@ -123,8 +123,8 @@ def test_wheels_of_a_pair_take_equal_speeds(paper: Mechanism) -> None:
     np.testing.assert_allclose(torques, [-expected, 0.0, expected, 0.0], atol=1e-12 * expected)
 
 
-def test_almost_equal_lengths_do_not_set_a_slow_pair_against_itself(paper: Mechanism) -> None:
-    """With lengths off by 1e-4 the pair b, d could relieve a and c by 1e-3 of its own speed."""
+def test_almost_equal_lengths_cause_no_opposite_torques_of_a_slow_pair(paper: Mechanism) -> None:
+    """With length errors of 1e-4 the pair b, d could unload a and c by 1e-3 of its own speed."""
     longer = replace(paper, link_lengths=paper.link_lengths * (1.0 + 1e-4 * np.arange(4.0)))
     wheel_map = reduced_form(longer, assemble(longer, 0.0, 1.0), np.zeros(2)).wheel_map
     limits, inertias = np.full(4, 1e-2), paper.flywheel_inertias
@@ -134,7 +134,7 @@ def test_almost_equal_lengths_do_not_set_a_slow_pair_against_itself(paper: Mecha
 
 
 def peak_speed(mechanism: Mechanism, name: str, travel: tuple[float, float]) -> float:
-    """Move by a soft step from rest and return the largest wheel speed on the way [rad/s]."""
+    """Run a soft step from rest and return the largest wheel speed [rad/s]."""
     start = np.array([[0.0, pi / 3], [0.0, 0.0], [0.0, 0.0]])
     step, period = SoftStep(start, start[0] + travel, 5.0), 4e-3
     inertias, limits = mechanism.flywheel_inertias, mechanism.motor_torque_limits
@@ -159,9 +159,9 @@ def test_no_other_rule_has_a_smaller_peak_speed_from_rest(
     linkage: str, travel: tuple[float, float], request: pytest.FixtureRequest,
 ) -> None:
     """
-    Speeds are optimal for the momentum at the horizon h, which turns meanwhile.
+    Speeds are optimal for the momentum at the horizon h, and the momentum changes until then.
 
-    With the angular frequency w = 2 pi / 5 s of the step that is worth (h w)^2 / 2, below 1 %.
+    With the angular frequency w = 2 pi / 5 s of the step the effect is (h w)^2 / 2, below 1 %.
     """
     mechanism = request.getfixturevalue(linkage)
     mechanism = replace(mechanism, motor_torque_limits=np.full(4, 1e-2))
@@ -178,9 +178,9 @@ def unequal_wheels(paper: Mechanism) -> Mechanism:
 @pytest.mark.parametrize('seed', range(10))
 def test_torques_follow_speeds_and_demand_without_jumps(seed: int, uneven: Mechanism) -> None:
     """
-    No chatter: along a path of speeds and demands, halved steps halve the largest change.
+    Halved steps along a path of speeds and demands halve the largest change of the torques.
 
-    The torques are a continuous, piecewise linear function; a jump would not get smaller.
+    The torques are a continuous, piecewise linear function; a jump would keep its size.
     """
     case = Case(uneven, 3 * seed + 1)
     rng = np.random.default_rng(seed)
@@ -198,9 +198,9 @@ def test_torques_follow_speeds_and_demand_without_jumps(seed: int, uneven: Mecha
     assert largest_change(8001) <= coarse / 8.0 * 1.05 + 1e-9 * TORQUE
 
 
-def test_lost_wheel_leaves_a_manoeuvre_on_its_way(steer: Callable[..., Any], prototype: Mechanism
-                                                  ) -> None:
-    """Four wheels, then three: the links end where they should, the lost wheel unpowered."""
+def test_manoeuvre_continues_after_loss_of_wheel(steer: Callable[..., Any], prototype: Mechanism
+                                                 ) -> None:
+    """The links reach their goal with three wheels, and the lost wheel has no power."""
     steered = steer(prototype, InitialState(), allocation='min_max_speed', setpoint_duration=4.0)
     steered.controller.setpoint(['link_a', 'link_b'], [0.4, 1.3])
     steered.ticks(300)

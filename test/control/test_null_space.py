@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Wheels shift momentum within their pairs, and no link notices."""
+"""Null-space torques exchange momentum within pairs of wheels and move no link."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ each_seed = pytest.mark.parametrize('seed', SEEDS)
 
 def take(rows: Array, metric: Array, wanted: Array, lower: Array = -NO_LIMIT,
          upper: Array = NO_LIMIT, given: Array | None = None) -> tuple[Array, float]:
-    """Return what `null_torques` fills in, and its factor."""
+    """Return the result of `null_torques` and its factor."""
     out = np.full(4, np.nan)
     factor = null_torques(
         rows, metric, wanted, MotorState(lower, upper, np.zeros(4)),
@@ -48,7 +48,7 @@ def take(rows: Array, metric: Array, wanted: Array, lower: Array = -NO_LIMIT,
 
 @pytest.fixture(scope='module')
 def at_rest(uneven: Mechanism) -> Callable[[int], Plant]:
-    """Return a function that makes a plant at rest, in some pose."""
+    """Return a function that makes a plant at rest in a random pose."""
     def make(seed: int) -> Plant:
         return Plant(uneven, Table(LinkSensorSettings(), WheelEncoders(0)),
                      InitialState(0.1 * seed, 0.1 * seed + 1.2), STEP, np.random.default_rng(0))
@@ -59,7 +59,7 @@ def at_rest(uneven: Mechanism) -> Callable[[int], Plant]:
 @each_seed
 def test_no_link_moves(seed: int, room: float, at_rest: Callable[[int], Plant], uneven: Mechanism
                        ) -> None:
-    """In the plant itself, whether the torques fit between the bounds or are scaled down."""
+    """The plant does not move, for torques within the bounds and for scaled torques."""
     plant = at_rest(seed)
     rows = reduced_form(uneven, plant.truth().link_angles, np.zeros(2)).wheel_map
     rng = np.random.default_rng(seed)
@@ -73,16 +73,16 @@ def test_no_link_moves(seed: int, room: float, at_rest: Callable[[int], Plant], 
     truth = plant.truth()
     np.testing.assert_allclose(
         truth.wheel_speeds, torques * STEP / uneven.flywheel_inertias, rtol=1e-9, atol=1e-12)
-    # The torques alone would give 1 rad/s^2 * 0.5 ms; what is left of that is rounding.
+    # A single torque gives 1 rad/s^2 * 0.5 ms; the sum is zero within rounding.
     assert np.abs(truth.link_rates).max() < 1e-14
 
 
 @pytest.mark.parametrize('failed', [None, 0, 3])
 @each_seed
-def test_nothing_harmless_is_nearer_to_what_is_wanted(
+def test_null_torques_are_the_nearest_to_the_wanted_ones(
     seed: int, failed: int | None, at_rest: Callable[[int], Plant], uneven: Mechanism,
 ) -> None:
-    """What is left out is, in the metric, orthogonal to all that moves no axis."""
+    """The difference is orthogonal to the null space in the metric."""
     rows = reduced_form(uneven, at_rest(seed).truth().link_angles, np.zeros(2)).wheel_map
     rng = np.random.default_rng(seed)
     available = np.arange(4) != failed
@@ -99,9 +99,9 @@ def test_nothing_harmless_is_nearer_to_what_is_wanted(
 
 
 @each_seed
-def test_what_is_given_comes_first(seed: int, at_rest: Callable[[int], Plant], uneven: Mechanism
-                                   ) -> None:
-    """Bounds are kept with what is given, and no more is cut than that takes."""
+def test_given_torques_have_priority(seed: int, at_rest: Callable[[int], Plant], uneven: Mechanism
+                                     ) -> None:
+    """The sum with the given torques is within the bounds, and the factor is the largest one."""
     rows = reduced_form(uneven, at_rest(seed).truth().link_angles, np.zeros(2)).wheel_map
     metric = uneven.flywheel_inertias
     rng = np.random.default_rng(seed)
@@ -115,16 +115,16 @@ def test_what_is_given_comes_first(seed: int, at_rest: Callable[[int], Plant], u
     assert factor == 1.0 or margins.min() < 1e-15
 
 
-def test_motor_that_gives_all_it_can_gives_no_more(paper: Mechanism) -> None:
+def test_motor_at_its_limit_gives_no_null_torque(paper: Mechanism) -> None:
     form = reduced_form(paper, assemble(paper, 0.0, 1.0), np.zeros(2))
     metric, limits = np.ones(4), np.ones(4)
     given = np.array([1.0, 0.2, 1.0 + 1e-16, 0.2])
-    # One of a and c would have to give more; the factor is one for all.
+    # Motor a or c is at its limit; one factor applies to all.
     torques, factor = take(form.wheel_map, metric, np.array([1.0, 1.0, -1.0, -1.0]), -limits,
                            limits, given)
     assert factor == 0.0
     assert not torques.any()
-    # The pair b and d alone does not ask a and c, whatever rounding has it.
+    # The pair b, d does not need a and c, in spite of rounding.
     torques, factor = take(form.wheel_map, metric, np.array([0.0, 0.5, 0.0, -0.5]), -limits,
                            limits, given)
     assert factor == 1.0
@@ -132,7 +132,7 @@ def test_motor_that_gives_all_it_can_gives_no_more(paper: Mechanism) -> None:
 
 
 def test_opposite_torques_near_a_change_point_are_no_null_motion(paper: Mechanism) -> None:
-    """With the opposite torques as an axis one way is left, for a rhombus (1, -1, -1, 1)."""
+    """With eta as an axis the null space of a rhombus has one dimension, (1, -1, -1, 1)."""
     rows = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0], [0.5, 0.5, -0.5, -0.5]])
     torques, _ = take(rows, np.ones(4), np.array([1.0, 0.0, 0.0, 0.0]))
     np.testing.assert_allclose(torques, [0.25, -0.25, -0.25, 0.25], rtol=1e-14)
@@ -146,8 +146,8 @@ def test_wheel_without_partner_has_no_null_motion(wanted: tuple[float, ...]) -> 
     np.testing.assert_allclose(torques, 0.0, atol=1e-15)
 
 
-def test_direction_lost_to_the_allocation_is_not_disturbed() -> None:
-    """Wheel c hardly turns axis a, too little to drive it; but it would turn it."""
+def test_null_torques_do_not_act_on_a_lost_direction() -> None:
+    """Wheel c has too little leverage to drive axis a, and would still move it."""
     rows = np.array([[1.0, 0.0, 0.01, 0.3], [0.0, 1.0, 0.4, 1.0]])
     torques, _ = take(rows, np.array([0.0, 1.0, 1.0, 1.0]), np.array([0.0, 1.0, 2.0, -1.0]))
     assert np.abs(torques).max() > 0.1
@@ -157,7 +157,7 @@ def test_direction_lost_to_the_allocation_is_not_disturbed() -> None:
 # Targets
 
 def settle(mechanism: Mechanism, target: Array, speeds: Array, metric: Array) -> Array:
-    """Let the wheels of a rhombus go for 20 time constants."""
+    """Return the speeds of wheels of a rhombus after 20 time constants."""
     rows = reduced_form(mechanism, assemble(mechanism, 0.0, 1.0), np.zeros(2)).wheel_map
     inertias = mechanism.flywheel_inertias
     for _ in range(4000):
@@ -174,7 +174,7 @@ def unequal_wheels(paper: Mechanism) -> Mechanism:
 
 
 def test_balanced_wheels_share_the_momentum_of_their_pair(unequal_wheels: Mechanism) -> None:
-    """Equal speeds, and so the least energy; what is left after 20 time constants is 1e-8."""
+    """Equal speeds have the least energy; the error after 20 time constants is 1e-8."""
     inertias = unequal_wheels.flywheel_inertias
     start = np.array([100.0, -20.0, -50.0, 60.0])
     rates = np.array([0.1, 0.2, 0.1, 0.2])
@@ -186,27 +186,27 @@ def test_balanced_wheels_share_the_momentum_of_their_pair(unequal_wheels: Mechan
     np.testing.assert_allclose(speeds, np.tile(expected, 2), atol=1e-5)
 
 
-def test_zero_is_standstill_beside_the_links() -> None:
+def test_target_zero_is_zero_speed_relative_to_the_links() -> None:
     rates = np.array([0.1, 0.2, 0.3, 0.4])
     np.testing.assert_array_equal(target_speeds('zero', rates, 30.0), rates)
     assert not towards(rates, target_speeds('zero', rates, 30.0), np.ones(4), 5.0).any()
 
 
-def test_bias_keeps_wheels_that_have_nothing_to_carry_from_standing_still(paper: Mechanism
-                                                                          ) -> None:
+def test_target_bias_keeps_unloaded_wheels_turning(paper: Mechanism
+                                                   ) -> None:
     inertias = paper.flywheel_inertias
     metric = inertias
     target = target_speeds('bias', np.zeros(4), 30.0)
     np.testing.assert_allclose(
         settle(paper, target, np.zeros(4), metric), [30.0, 30.0, -30.0, -30.0], atol=1e-5)
-    # Momentum of a pair comes on top of it, equal for both.
+    # The momentum of a pair adds the same speed to both wheels.
     np.testing.assert_allclose(
         settle(paper, target, np.array([10.0, 0.0, 10.0, 0.0]), metric),
         [40.0, 30.0, -20.0, -30.0], atol=1e-5)
 
 
-def test_wheel_left_to_itself_approaches_its_target(paper: Mechanism) -> None:
-    """As exp(-bandwidth t), in steps of 1e-4 time constants: 1e-4 off after two of them."""
+def test_wheel_approaches_its_target_exponentially(paper: Mechanism) -> None:
+    """The error is exp(-bandwidth t) to 1e-4, with steps of 1e-4 time constants."""
     inertias, speeds, target = paper.flywheel_inertias, np.full(4, 80.0), np.full(4, 30.0)
     for _ in range(20_000):
         speeds = speeds + towards(speeds, target, inertias, 5.0) / inertias * 2e-5
@@ -220,8 +220,8 @@ def test_unknown_target_is_refused(refuses: Refuses) -> None:
         assert target_speeds(name, np.zeros(4), 1.0).shape == (4,)
 
 
-def test_whatever_comes_null_torques_are_numbers() -> None:
-    """Dependent rows, no wheels, no room; seed 7."""
+def test_null_torques_are_finite_for_any_input() -> None:
+    """Cases: dependent rows, no wheels, empty bounds; seed 7."""
     rng = np.random.default_rng(7)
     for trial in range(5000):
         rows = rng.choice([0.0, 1.0, -1.0, 0.5, 1e-9, 30.0], (int(rng.integers(1, 4)), 4))
@@ -232,6 +232,6 @@ def test_whatever_comes_null_torques_are_numbers() -> None:
         assert 0.0 <= factor <= 1.0, f'trial {trial}'
         assert np.isfinite(torques).all(), f'trial {trial}'
         assert (np.abs(torques) <= limits).all(), f'trial {trial}'
-        # A direction counts from 1e-12 of the largest gain on, which is up to 60; torques are up
-        # to 4, and a tenth of what they are in the metric.
+        # Directions with less than 1e-12 of the largest gain, at most 60, are ignored. Torques
+        # are at most 4, and ten times as large in the metric.
         assert np.abs(rows @ torques).max() < 1e-12 * 60.0 * 40.0, f'trial {trial}'

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The reference goes on without a jump, and comes to rest before a change point."""
+"""The reference is continuous and comes to rest before a change point."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def moving_reference(mechanism: Mechanism, angles: Array, travel: Array, duratio
 
 
 def run(reference: ReferenceGenerator, now: int, seconds: float) -> tuple[Array, Array, Array]:
-    """Go on, and return angles, rates and accelerations (n, 4), the present first."""
+    """Run, and return angles, rates and accelerations (n, 4) from the present on."""
     found = [(reference.angles.copy(), reference.rates.copy(), reference.accelerations.copy())]
     for _ in range(round(seconds / PERIOD)):
         now += PERIOD_NS
@@ -53,16 +53,16 @@ def run(reference: ReferenceGenerator, now: int, seconds: float) -> tuple[Array,
 
 
 def check_continuous(angles: Array, rates: Array, jerk: float) -> None:
-    """Rates are the derivative of angles, and change by what a jerk allows."""
-    # The trapezoid of the rates is off by no more than jerk T^3 / 12.
+    """Check that rates are the derivative of angles, within the effect of a jerk."""
+    # The error of the trapezoidal rule is at most jerk T^3 / 12.
     np.testing.assert_allclose(
         np.diff(angles, axis=0), 0.5 * PERIOD * (rates[1:] + rates[:-1]),
         atol=jerk * PERIOD ** 3 / 12.0 + 1e-13)
 
 
-# Where it begins
+# Begin
 
-def test_it_stands_where_the_links_are(uneven: Mechanism) -> None:
+def test_reference_is_at_the_links(uneven: Mechanism) -> None:
     reference, angles = ReferenceGenerator(uneven), assemble(uneven, 0.3, 1.5)
     reference.rest_at(angles)
     np.testing.assert_array_equal(reference.angles, angles)
@@ -76,10 +76,10 @@ def test_it_stands_where_the_links_are(uneven: Mechanism) -> None:
 @pytest.mark.parametrize('turns_c', [0, 1, -3])
 @pytest.mark.parametrize('turns_d', [0, -1, 2])
 @pytest.mark.parametrize('theta', [1.0, 0.0, pi, -0.5])
-def test_pairs_are_parallel_on_whatever_turns_they_are(
+def test_pairs_are_parallel_on_any_turns(
     theta: float, turns_c: int, turns_d: int, paper: Mechanism,
 ) -> None:
-    """It is nearest to what it was given, and not a jump by turns."""
+    """The reference is nearest to the given angles, on their turns."""
     reference = ReferenceGenerator(paper)
     off = np.array([1e-3, -2e-3, -1e-3, 4e-3])
     turns = 2.0 * pi * np.array([0, 0, turns_c, turns_d])
@@ -89,7 +89,7 @@ def test_pairs_are_parallel_on_whatever_turns_they_are(
     np.testing.assert_allclose(
         reference.angles[2:] - reference.angles[:2], 2.0 * pi * np.array([turns_c, turns_d]),
         atol=1e-12)
-    # The mean of each pair: half of the difference is left.
+    # The reference is the mean of each pair, so half of the difference remains.
     np.testing.assert_allclose(np.abs(reference.angles - measured), [1e-3, 3e-3, 1e-3, 3e-3],
                                atol=1e-12)
     step = SoftStep(reference.motion.copy(), reference.motion[0] + 0.3, 1.0)
@@ -111,18 +111,18 @@ def test_links_c_and_d_follow_by_closure(seed: int, uneven: Mechanism) -> None:
     np.testing.assert_allclose(reference.rates[2:], gamma @ reference.rates[:2], rtol=1e-12)
     assert reference.time_left(now) == pytest.approx(1.2)
     reached, rates, _ = run(reference, now, 1.2)
-    # Third derivatives of a quintic by 0.4 rad in 2 s, a and b, and what the gearing makes of it.
+    # The third derivative is that of a quintic of 0.4 rad in 2 s, times Gamma.
     check_continuous(reached, rates, 60.0 * 0.4 / 2.0 ** 3 * 10.0)
     assert not reference.moving
     assert not reference.rates.any()
     np.testing.assert_allclose(reference.angles, reference.goal, atol=1e-9)
 
 
-# Giving up
+# Halt
 
 @pytest.mark.parametrize('seconds', [0.2, 1.0, 1.7])
 @pytest.mark.parametrize('linkage', ['uneven', 'paper'])
-def test_halt_comes_to_rest_soon_without_a_jump(
+def test_halt_comes_to_rest_in_time_without_a_jump(
     linkage: str, seconds: float, request: pytest.FixtureRequest,
 ) -> None:
     mechanism = request.getfixturevalue(linkage)
@@ -132,18 +132,18 @@ def test_halt_comes_to_rest_soon_without_a_jump(
     reference.stop(now)
     assert reference.goal is not None
     reference.advance(now)
-    # Angle, rate and acceleration are taken over.
+    # Angle, rate and acceleration are continuous.
     np.testing.assert_allclose(reference.motion, motion, atol=1e-12)
     angles, rates, _ = run(reference, now, STOPPING_TIME + 2.0 * PERIOD)
     check_continuous(angles, rates, 60.0 * 10.0)
     assert not rates[-1].any()
     assert not reference.moving
-    # No farther than it would have gone at this rate, or as the acceleration took it.
+    # The travel is at most that of the present rate and acceleration.
     reach = np.abs(motion[1]) * STOPPING_TIME + 0.5 * np.abs(motion[2]) * STOPPING_TIME ** 2
     assert (np.abs(angles[:, :2] - motion[0]) <= reach + 1e-12).all()
 
 
-def test_halt_at_rest_changes_nothing(paper: Mechanism) -> None:
+def test_halt_at_rest_has_no_effect(paper: Mechanism) -> None:
     reference = ReferenceGenerator(paper)
     reference.rest_at(assemble(paper, 0.3, 1.5))
     before = reference.angles.copy()
@@ -153,8 +153,8 @@ def test_halt_at_rest_changes_nothing(paper: Mechanism) -> None:
 
 
 @each_seed
-def test_moving_links_are_taken_over(seed: int, uneven: Mechanism) -> None:
-    """The reference begins with the rates that they have, and stops within its time."""
+def test_reference_starts_with_the_rates_of_the_links(seed: int, uneven: Mechanism) -> None:
+    """The reference stops within its stopping time."""
     rng = np.random.default_rng(seed)
     reference, angles = ReferenceGenerator(uneven), assemble(uneven, 0.3, 1.5)
     rates = np.zeros(4)
@@ -169,13 +169,13 @@ def test_moving_links_are_taken_over(seed: int, uneven: Mechanism) -> None:
     reached, speeds, _ = run(reference, 10 ** 9, STOPPING_TIME)
     check_continuous(reached, speeds, 60.0 * 10.0)
     assert not reference.rates.any()
-    # A quintic from a rate to rest over half of rate times time turns back nowhere.
+    # A quintic from a rate to rest over half of rate times time is monotonic.
     assert (reached[1:, :2] - reached[:-1, :2]) @ np.diag(np.sign(rates[:2])) == pytest.approx(
         np.abs(np.diff(reached[:, :2], axis=0)), abs=1e-15)
 
 
 def near_change_point(mechanism: Mechanism, sine: float) -> Array:
-    """Fold c and d until |sin(phi_d - phi_c)| is so small."""
+    """Return angles with a given |sin(phi_d - phi_c)|."""
     lengths = mechanism.link_lengths
     a, b, c, d = lengths
     gap = np.sqrt(c * c + d * d - 2.0 * c * d * np.cos(pi - np.arcsin(sine)))
@@ -185,7 +185,7 @@ def near_change_point(mechanism: Mechanism, sine: float) -> Array:
 
 @pytest.fixture(scope='module')
 def folding() -> Mechanism:
-    """Make a linkage whose links c and d can lie in line, with no equal opposite links."""
+    """Make a linkage with unequal opposite links whose links c and d can be in line."""
     return Mechanism(  # type: ignore[arg-type]
         [0.12, 0.10, 0.09, 0.10], [0.02] * 4, [2.2e-5] * 4, [[0.05, 0.0]] * 4, [3.4e-7] * 4)
 
@@ -193,10 +193,10 @@ def folding() -> Mechanism:
 @pytest.mark.parametrize(('sine', 'rate', 'at_once'), [
     (0.5, 0.3, False), (0.3, 0.3, False), (0.13, 0.05, False), (0.11, 0.02, False),
     (0.11, 1.0, True), (0.1001, 0.3, True)])
-def test_it_comes_to_rest_before_a_change_point(
+def test_reference_comes_to_rest_before_a_change_point(
     sine: float, rate: float, at_once: bool, folding: Mechanism,
 ) -> None:
-    """In less time the nearer that is; at once if there is no time."""
+    """The stopping time decreases with the distance to the change point, down to zero."""
     reference, angles = ReferenceGenerator(folding), near_change_point(folding, sine)
     assert abs(sin(angles[3] - angles[2])) == pytest.approx(sine, rel=1e-9)
     rates = np.array([0.0, rate, 0.0, 0.0])
@@ -221,7 +221,7 @@ def test_on_the_parallelogram_a_change_point_is_no_obstacle(paper: Mechanism) ->
     assert theta[-1] == pytest.approx(-0.05 + 0.3 * 0.5 * STOPPING_TIME)
 
 
-def test_following_the_links_it_has_no_motion_of_its_own(paper: Mechanism) -> None:
+def test_reference_that_follows_the_links_has_no_motion(paper: Mechanism) -> None:
     reference, _ = moving_reference(
         paper, assemble(paper, 0.3, 1.5), np.array([0.4, 0.3]), 2.0, 0.8)
     here = assemble(paper, 0.5, 1.4)

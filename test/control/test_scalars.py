@@ -48,7 +48,7 @@ def ticked(mechanism: Mechanism, angles: Array, rates: Array, speeds: Array,
     return controller
 
 
-def test_before_anything_happens_there_are_numbers(paper: Mechanism) -> None:
+def test_scalars_are_finite_before_the_first_motion(paper: Mechanism) -> None:
     controller = Controller(paper, ControllerSettings())
     controller.tick(10 ** 9, assemble(paper, 0.0, 1.0), NONE, QUIET, NONE, NONE)
     assert np.isfinite(allocation_scalars(controller)).all()
@@ -62,7 +62,7 @@ def test_before_anything_happens_there_are_numbers(paper: Mechanism) -> None:
 def test_momenta_are_those_of_the_whole_and_of_the_axes(
     seed: int, linkage: str, request: pytest.FixtureRequest,
 ) -> None:
-    """That of an axis is `A u + G If omega`, links and wheels in the terms of paper eq. 6."""
+    """The momentum of an axis is `A u + G If omega`, in the terms of paper eq. 6."""
     mechanism = request.getfixturevalue(linkage)
     rng = np.random.default_rng(seed)
     angles = assemble(mechanism, 0.3, 0.3 + rng.uniform(0.9, 2.0))
@@ -79,13 +79,13 @@ def test_momenta_are_those_of_the_whole_and_of_the_axes(
     np.testing.assert_allclose(
         [found['axis_a_n_m_s'], found['axis_b_n_m_s']], on_axes, rtol=1e-9, atol=1e-18)
     if linkage == 'paper':
-        # Of a parallelogram the pairs have all of it.
+        # The pairs of a parallelogram have all momentum.
         assert on_axes.sum() == pytest.approx(whole, rel=1e-9)
     assert found['margin'] == pytest.approx(1.0 - np.abs(speeds).max() / 500.0, rel=1e-12)
 
 
 def test_pairs_of_a_rhombus_keep_their_momentum(steer: Steer, prototype: Mechanism) -> None:
-    """Free of friction each for itself, whatever the wheels do; encoders tell half a tick late."""
+    """Without friction each pair conserves its momentum; encoders lag by half a tick."""
     steered = steer(prototype, InitialState(), setpoint_duration=2.0)
     steered.controller.setpoint(['link_a', 'link_b'], [0.4, 1.2])
     held = largest = 0.0
@@ -93,7 +93,7 @@ def test_pairs_of_a_rhombus_keep_their_momentum(steer: Steer, prototype: Mechani
         torques = steered.tick().torques
         largest = max(largest, np.abs(torques).max())
         found = momentum_of(steered.controller)
-        # Between two ticks motors come to their torque and links change theirs: a little more.
+        # The torques also change between two ticks, by less than 5 %.
         late = 1.05 * 0.5 * 4e-3 * largest
         assert abs(found['axis_a_n_m_s']) <= 2.0 * late + 1e-12
         assert abs(found['axis_b_n_m_s']) <= 2.0 * late + 1e-12
@@ -104,7 +104,7 @@ def test_pairs_of_a_rhombus_keep_their_momentum(steer: Steer, prototype: Mechani
 
 
 def test_axes_of_another_branch_are_its_pairs(paper: Mechanism) -> None:
-    """Folded, a turns with b and c with d: `T^T (M omega + If (omega + Omega))` of the pairs."""
+    """On the folded branch a turns with b: `T^T (M omega + If (omega + Omega))` of the pairs."""
     angles, rates = np.array([0.1, 0.1, 0.9, 0.9]), np.array([0.2, 0.2, -0.3, -0.3])
     speeds = np.array([10.0, -20.0, 30.0, 5.0])
     controller = ticked(paper, angles, rates, speeds, change_points='choose')
@@ -126,7 +126,7 @@ def test_scale_and_saturated_wheels(uneven: Mechanism) -> None:
     found, output = allocation_of(controller), controller.law.output
     assert found['scale'] == output.scale < 1.0
     at_bound = [found[f'saturated_{link}'] for link in LINKS]
-    # All in proportion: just the one that is at its bound limits them.
+    # All torques are scaled; one wheel at its bound limits them.
     assert sum(at_bound) == 1.0
     wheel = at_bound.index(1.0)
     assert abs(output.torques[wheel]) == pytest.approx(
@@ -138,15 +138,15 @@ def test_scale_and_saturated_wheels(uneven: Mechanism) -> None:
 
 
 @pytest.mark.parametrize('theta', [0.0, 0.02, 3.14])
-def test_hold_at_a_change_point_is_told(theta: float, paper: Mechanism) -> None:
+def test_hold_at_a_change_point_is_reported(theta: float, paper: Mechanism) -> None:
     angles = np.array([0.0, theta, 0.0, theta])
     found = allocation_of(ticked(paper, angles, NONE, NONE))
     assert found['branch_hold'] == 1.0
     assert np.isfinite(list(found.values())).all()
 
 
-def test_null_speeds_are_what_moves_no_axis(paper: Mechanism, uneven: Mechanism) -> None:
-    """For equal wheels on a rhombus the difference within each pair, half each."""
+def test_null_speeds_move_no_axis(paper: Mechanism, uneven: Mechanism) -> None:
+    """For equal wheels on a rhombus they are half of the difference within each pair."""
     angles = assemble(paper, 0.0, 1.0)
     found = allocation_of(ticked(paper, angles, NONE, np.array([100.0, -20.0, 40.0, 60.0])))
     np.testing.assert_allclose(
@@ -162,11 +162,11 @@ def test_null_speeds_are_what_moves_no_axis(paper: Mechanism, uneven: Mechanism)
     assert np.abs(null).max() > 1.0
 
 
-def test_time_left_is_named_only_if_it_comes(prototype: Mechanism) -> None:
+def test_time_left_is_present_only_if_it_is_finite(prototype: Mechanism) -> None:
     speeds = np.full(4, 50.0)
     controller = ticked(prototype, assemble(prototype, 0.0, 1.0), NONE, speeds)
     assert 'time_left_s' not in momentum_of(controller)
-    # One long period of rest is enough of an observation.
+    # One long period at rest settles the mean.
     controller.momentum.reset(speeds)
     controller.momentum.update(100.0, speeds, NONE, NONE)
     controller.momentum.drift[:] = [5.0, 0.0, 0.0, 0.0]

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A setpoint means what it names, or is refused with the name or number that speaks against it."""
+"""Setpoints: goals of named links, refusals with name or value, paths, and change points."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -61,7 +61,7 @@ def goal_of(driven: Any, goals: dict[str, float]) -> Array:
 
 # Names
 
-@pytest.mark.parametrize(('names', 'positions', 'kind', 'told'), [
+@pytest.mark.parametrize(('names', 'positions', 'kind', 'part'), [
     ([], [], 'length', ''),
     (['link_a'], [], 'length', '0'),
     (['link_a'], [1.0, 2.0], 'length', '2'),
@@ -71,13 +71,13 @@ def goal_of(driven: Any, goals: dict[str, float]) -> Array:
     (['link_a', 'link_c'], [0.0, nan], 'finite', 'link_c is nan'),
     (['link_d'], [-inf], 'finite', 'link_d is -inf'),
 ])
-def test_names_that_cannot_be_read_are_refused(
-    names: list[str], positions: list[float], kind: str, told: str,
+def test_invalid_names_are_refused(
+    names: list[str], positions: list[float], kind: str, part: str,
 ) -> None:
     with pytest.raises(SetpointError) as caught:
         check_names(names, positions)
     assert caught.value.values['kind'] == kind
-    assert told in str(caught.value)
+    assert part in str(caught.value)
 
 
 def test_names_may_come_in_any_order() -> None:
@@ -137,10 +137,10 @@ def test_more_links_than_needed_must_agree(count: int, drive: Drive, uneven: Mec
 @pytest.mark.parametrize('turns', [-7, 0, 1, 3])
 @pytest.mark.parametrize('start', [-20.0, 0.0, 3.0])
 @pytest.mark.parametrize('turn', [0.1, 3.1, -3.1])
-def test_links_take_the_shortest_way_round(
+def test_links_take_the_shortest_path(
     turns: int, start: float, turn: float, drive: Drive, paper: Mechanism,
 ) -> None:
-    """The whole turns by `turn`, whatever turns the present and the named angles are on."""
+    """The whole turns by `turn`, for present and named angles on any turns."""
     driven = drive(paper, start, start + 1.2)
     present = driven.angles.copy()
     goal = goal_of(driven, {
@@ -148,8 +148,8 @@ def test_links_take_the_shortest_way_round(
     np.testing.assert_allclose(goal, present + turn, atol=1e-9)
 
 
-def test_moving_links_take_the_shortest_way_from_their_goal(drive: Drive) -> None:
-    """A second setpoint during a move is measured from where the links are told to be."""
+def test_moving_links_take_the_shortest_path_from_the_reference(drive: Drive) -> None:
+    """A second setpoint during a move starts from the reference."""
     driven = drive(phi_a=0.0, phi_b=1.2)
     goal_of(driven, {'link_a': 2.0, 'link_b': 3.2})
     for _ in range(10):
@@ -165,13 +165,13 @@ def test_angles_that_cannot_close_are_refused(drive: Drive) -> None:
         [0.3, 0.3, 0.2, 0.2], [0.02] * 4, [2e-5] * 4, [[0.05, 0.0]] * 4, [3e-7] * 4)
     error = refusal(drive(long, 0.0, 1.0), {'link_a': 0.0, 'link_b': 2.5})
     assert error.values['name'] == 'closure'
-    # Sides of 0.2 m reach 0.4 m; links of 0.3 m at 2.5 rad need 0.6 sin(1.25).
-    for told in ('link_b = 2.5000 rad', '0.4 m', '0.569'):
-        assert told in str(error)
+    # Links of 0.2 m reach 0.4 m; links of 0.3 m at 2.5 rad need 0.6 sin(1.25).
+    for part in ('link_b = 2.5000 rad', '0.4 m', '0.569'):
+        assert part in str(error)
 
 
 @pytest.mark.parametrize('goal', [0.05, 0.0, -0.5, pi + 0.5, pi - 0.05])
-def test_change_point_on_the_way_is_refused(goal: float, drive: Drive) -> None:
+def test_change_point_on_the_path_is_refused(goal: float, drive: Drive) -> None:
     values = refusal(drive(phi_b=0.8), {'link_a': 0.0, 'link_b': goal}).values
     if goal != 0.0:
         assert (values['name'], values['limit']) == ('change_point', PLANNING_MARGIN)
@@ -180,7 +180,7 @@ def test_change_point_on_the_way_is_refused(goal: float, drive: Drive) -> None:
 
 @pytest.mark.parametrize('theta', [0.02, 0.05, 0.09, -0.03, pi - 0.05])
 def test_move_away_from_a_change_point_is_allowed(theta: float, drive: Drive) -> None:
-    """Whoever gets too close must be able to leave."""
+    """A linkage too close to a change point can leave it."""
     driven = drive(phi_a=0.3, phi_b=0.3 + theta)
     outward = np.sign(np.sin(theta)) * np.sign(np.cos(theta)) * 0.5
     goal = goal_of(driven, {'link_b': 0.3 + theta + outward})
@@ -189,10 +189,10 @@ def test_move_away_from_a_change_point_is_allowed(theta: float, drive: Drive) ->
 
 @pytest.mark.parametrize('theta', [0.02, 0.05, 0.09])
 @pytest.mark.parametrize('turn', [0.0, 1.0])
-def test_keeping_the_distance_to_a_change_point_is_no_approach(
+def test_move_at_a_constant_distance_to_a_change_point_is_allowed(
     theta: float, turn: float, drive: Drive,
 ) -> None:
-    """Told to stay, or to turn as a whole, it comes no closer: rounding is no reason."""
+    """A turn of the whole, or no motion, is accepted in spite of rounding."""
     driven = drive(phi_a=0.3, phi_b=0.3 + theta)
     np.testing.assert_allclose(
         goal_of(driven, {'link_a': 0.3 + turn, 'link_b': 0.3 + turn + theta}),
@@ -205,14 +205,14 @@ def test_move_closer_to_a_change_point_is_refused(drive: Drive) -> None:
 
 
 def test_other_branch_is_refused(drive: Drive, uneven: Mechanism) -> None:
-    """Where c names an assembly that only the other branch has, it is not moved elsewhere."""
+    """The angle of link c exists only on the other branch, and the goal is not changed."""
     driven = drive(uneven, 0.2, 1.5)
     other = assemble(uneven, 0.2, 1.5, 'crossed')
     error = refusal(driven, {LINK_NAMES[link]: float(other[link]) for link in range(3)})
     assert error.values['name'] == 'link_c'
 
 
-# What was accepted
+# Accepted goals
 
 def random_linkage(rng: np.random.Generator) -> Mechanism:
     while True:
@@ -239,8 +239,8 @@ def side_of_joint_3(angles: Array) -> float:
 
 
 @pytest.mark.parametrize('pair', PAIRS, ids=lambda pair: '-'.join(names_of(*pair)))
-def test_accepted_goal_holds_what_was_named(pair: tuple[int, int], drive: Drive) -> None:
-    """On any linkage, from any pose: both named links are where they were told, and it closes."""
+def test_accepted_goal_has_the_named_angles(pair: tuple[int, int], drive: Drive) -> None:
+    """For any linkage and pose the goal has both named angles, and the loop closes."""
     accepted = 0
     for seed in range(100):
         rng = np.random.default_rng(seed)
@@ -254,7 +254,7 @@ def test_accepted_goal_holds_what_was_named(pair: tuple[int, int], drive: Drive)
             continue
         accepted += 1
         assert closure_error(mechanism, goal) < 1e-14, f'seed {seed}'
-        # Joint 3 stays on its side of the diagonal: only a change point leads across.
+        # Joint 3 stays on its side of the diagonal, since there is no change point.
         assert side_of_joint_3(goal) == side_of_joint_3(present), f'seed {seed}'
         for link, angle in named.items():
             off = (goal[link] - angle + pi) % (2.0 * pi) - pi
@@ -262,7 +262,7 @@ def test_accepted_goal_holds_what_was_named(pair: tuple[int, int], drive: Drive)
     assert accepted > 20
 
 
-# Ways round
+# Paths
 
 def from_rest(mechanism: Mechanism, angles: Array, goals: dict[int, float], **options: bool
               ) -> tuple[SoftStep, Array]:
@@ -279,11 +279,11 @@ def degrees(*angles: float) -> Any:
 
 
 @pytest.mark.parametrize(('theta', 'goal', 'end'), [
-    (60.0, (100.0, -90.0), (100.0, 270.0)),     # not by -150: that drags theta through 0
-    (60.0, (-170.0, -30.0), (-170.0, -30.0)),   # the shortest keeps away
+    (60.0, (100.0, -90.0), (100.0, 270.0)),     # not by -150, which moves theta through 0
+    (60.0, (-170.0, -30.0), (-170.0, -30.0)),   # the shortest path has no change point
     (60.0, (170.0, -70.0), (-190.0, -70.0)),    # a by -190 and b by -130, not a by 170
 ])
-def test_configuration_takes_the_way_that_keeps_away_from_change_points(
+def test_configuration_takes_the_path_without_change_points(
     theta: float, goal: tuple[float, float], end: tuple[float, float], paper: Mechanism,
 ) -> None:
     start = rhombus(0.0, np.radians(theta))
@@ -294,7 +294,7 @@ def test_configuration_takes_the_way_that_keeps_away_from_change_points(
 @pytest.mark.parametrize(('pair', 'goals'), [
     ((0, 1), (100.0, -90.0)), ((2, 1), (100.0, -90.0)), ((0, 3), (100.0, -90.0)),
     ((2, 3), (100.0, -90.0))])
-def test_opposite_links_stand_for_each_other(
+def test_opposite_links_are_equivalent(
     pair: tuple[int, int], goals: tuple[float, float], paper: Mechanism,
 ) -> None:
     _, reached = from_rest(
@@ -303,17 +303,17 @@ def test_opposite_links_stand_for_each_other(
 
 
 def passes_change_point(begin: float, end: float) -> bool:
-    """Tell whether theta meets a change point between two values, by the margin, by itself."""
+    """Return whether theta comes closer to a change point than the margin between two values."""
     low, high = min(begin, end), max(begin, end)
     multiple = np.ceil((low - np.arcsin(PLANNING_MARGIN)) / pi) * pi
     return bool(multiple - np.arcsin(PLANNING_MARGIN) < high)
 
 
 @pytest.mark.parametrize('seed', range(300))
-def test_accepted_way_is_the_shortest_that_keeps_away(
+def test_accepted_path_is_the_shortest_without_change_points(
     seed: int, paper: Mechanism, refuses: Refuses,
 ) -> None:
-    """Whatever start and goal on a rhombus; theta goes straight from its start to its end."""
+    """The test covers any start and goal on a rhombus; theta is monotonic."""
     rng = np.random.default_rng(seed)
     theta = rng.uniform(0.15, pi - 0.15) + pi * rng.integers(-2, 3)
     angles = rhombus(rng.uniform(-10.0, 10.0), theta)
@@ -333,10 +333,10 @@ def test_accepted_way_is_the_shortest_that_keeps_away(
             reached[:2] - angles[:2], (kept or ways)[0], atol=1e-9, err_msg=f'seed {seed}')
 
 
-def test_no_way_skips_a_change_point_between_two_looks(
+def test_no_path_skips_a_change_point_between_two_samples(
     paper: Mechanism, refuses: Refuses,
 ) -> None:
-    """From 0.02 rad beside one the margin is narrow at first, and wide at the next one."""
+    """At 0.02 rad from a change point the margin is small at the start, and large at the next."""
     angles = rhombus(0.0, 0.02)
     for turn in (pi + 0.5, 2 * pi + 0.5, 4 * pi + 0.5):
         move = SoftStep(np.array([angles[:2], [0.0] * 2, [0.0] * 2]),
@@ -349,7 +349,7 @@ def test_no_way_skips_a_change_point_between_two_looks(
 
 @pytest.fixture(scope='module')
 def parallelogram() -> Mechanism:
-    """Make a parallelogram with nothing equal but opposite lengths."""
+    """Make a parallelogram whose only equal parameters are opposite lengths."""
     return Mechanism(  # type: ignore[arg-type]
         [0.12, 0.08, 0.12, 0.08], [0.02, 0.03, 0.025, 0.018], [2.2e-5, 1.5e-5, 3e-5, 1.8e-5],
         [[0.05, 0.01], [0.04, -0.01], [0.06, 0.005], [0.05, 0.0]], [3e-7, 4e-7, 5e-7, 2e-7])
@@ -357,7 +357,7 @@ def parallelogram() -> Mechanism:
 
 @pytest.mark.parametrize('theta', [0.0, pi, 0.4, -2.0, 1e-3, pi - 1e-3])
 @pytest.mark.parametrize('turns', [0, 2])
-def test_parallelogram_is_told(
+def test_parallelogram_is_recognised(
     theta: float, turns: int, paper: Mechanism, parallelogram: Mechanism, uneven: Mechanism,
 ) -> None:
     angles = rhombus(0.3, theta) + 2.0 * pi * turns * np.array([0, 0, 1, -1])
@@ -378,11 +378,11 @@ def test_other_branch_is_no_parallelogram(theta: float, parallelogram: Mechanism
 @pytest.mark.parametrize('start', [0.8, 0.0, pi, -0.02])
 @pytest.mark.parametrize('names', [(1,), (3,), (0, 1), (2, 3), (1, 2), (0, 3), (0, 1, 2),
                                    (0, 2, 3), (0, 1, 2, 3)], ids=lambda links: str(links))
-def test_where_allowed_a_way_crosses_and_parks(
+def test_path_crosses_and_ends_at_change_points_where_allowed(
     goal: float, start: float, names: tuple[int, ...], paper: Mechanism,
     parallelogram: Mechanism,
 ) -> None:
-    """From anywhere to anywhere, a change point included: opposite links stay parallel."""
+    """Opposite links stay parallel for any start and goal, also at a change point."""
     for mechanism in (paper, parallelogram):
         angles, wanted = rhombus(0.3, start), rhombus(0.3, goal)
         move, reached = from_rest(
@@ -392,13 +392,13 @@ def test_where_allowed_a_way_crosses_and_parks(
         np.testing.assert_array_equal(segment[:, 2:], segment[:, :2])
         np.testing.assert_allclose(segment[[0, -1]], [angles, reached], atol=1e-12)
         assert max(closure_error(mechanism, pose) for pose in segment) < 1e-16
-        # No corner of a step is larger than a way can be followed.
+        # Steps of the path are small enough for the closure to follow.
         assert np.abs(np.diff(segment, axis=0)).max() < 0.035
 
 
 @pytest.mark.parametrize('theta', [0.0, pi])
 @pytest.mark.parametrize('crossing', [False, True])
-def test_at_a_change_point_the_whole_may_turn_and_leave(
+def test_whole_may_turn_at_a_change_point_and_leave_it(
     theta: float, crossing: bool, paper: Mechanism,
 ) -> None:
     angles = rhombus(0.3, theta)
@@ -434,7 +434,7 @@ def test_named_links_that_contradict_each_other_are_refused_when_crossing(
         from_rest(paper, rhombus(0.0, 0.0), {1: 0.7, 3: 0.7}, crossing=True)
 
 
-def test_motion_too_wild_to_check_is_refused(
+def test_motion_too_large_to_check_is_refused(
     paper: Mechanism, refuses: Refuses,
 ) -> None:
     angles = rhombus(0.0, 1.0)

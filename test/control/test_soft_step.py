@@ -21,7 +21,7 @@ durations = st.floats(0.1, 100.0)
 
 @pytest.mark.parametrize('share', [0.0, 0.1, 0.25, 0.5, 0.75, 0.999, 1.0])
 def test_from_rest_it_is_the_soft_step_of_the_paper(share: float) -> None:
-    """10 s^3 - 15 s^4 + 6 s^5, and its derivatives."""
+    """The values are 10 s^3 - 15 s^4 + 6 s^5 and its derivatives."""
     duration, rise = 8.0, GOAL - REST[0]
     s = share
     step = SoftStep(REST, GOAL, duration).at(share * duration)
@@ -71,7 +71,7 @@ def test_rate_and_acceleration_are_the_derivatives(
                 <= 2e-5 * size + 1e-9).all()
 
 
-def test_before_its_begin_it_stays_at_the_start() -> None:
+def test_motion_before_the_begin_is_rest_at_the_start() -> None:
     moving = np.array([[0.2, -1.0], [0.3, 0.1], [0.05, -0.2]])
     np.testing.assert_allclose(SoftStep(moving, GOAL, 5.0).at(-1.0), moving, rtol=1e-15)
 

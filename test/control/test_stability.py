@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Gains are refused where the sampled loop, simulated, does not come to rest."""
+"""The decay rate of the sampled loop agrees with simulations, and unstable gains are refused."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STEP = 5e-5
 
 
 def unchecked(**values: Any) -> ControllerSettings:
-    """Return settings with values that the schema would refuse."""
+    """Return settings with values beyond the limits of the parameters."""
     settings = ControllerSettings()
     for name, value in values.items():
         object.__setattr__(settings, name, value)
@@ -48,12 +48,12 @@ def with_lag(mechanism: Mechanism, lag: float) -> Mechanism:
 def simulate(bandwidth: float, damping: float, period: float, by_speed: bool, errors: Array,
              packed: NDArray[np.record]) -> None:
     """
-    Hold a double integrator as the controller does, with a motor as the plant has it.
+    Simulate the control law on a double integrator with the motor of the plant.
 
-    Torques are in units of acceleration times the wheel's inertia. A command answers the sample
-    of a period ago, and is held.
+    Torques are in units of acceleration times the inertia of the wheel. A command is computed from
+    the sample of the previous period, and is held.
 
-    :param errors: receives the error and its rate over the bandwidth, as one, at each sample.
+    :param errors: output; norm of the error and its rate over the bandwidth at each sample.
     """
     motors = packed[0]
     inertia = motors.inertia[0]
@@ -79,26 +79,26 @@ def simulate(bandwidth: float, damping: float, period: float, by_speed: bool, er
 
 @pytest.mark.parametrize('by_speed', [False, True])
 @pytest.mark.parametrize('seed', SEEDS)
-def test_errors_of_the_simulated_loop_fall_off_at_the_rate_told(
+def test_errors_of_the_simulated_loop_decay_at_the_predicted_rate(
     seed: int, by_speed: bool, prototype: Mechanism,
 ) -> None:
-    """Random gains, rates and lags; whether errors fall or grow, and how fast."""
+    """Gains, rates and lags are random; sign and size of the decay rate agree."""
     rng = np.random.default_rng(seed)
     bandwidth, damping = float(rng.uniform(0.5, 40.0)), float(rng.uniform(0.3, 2.0))
     period, lag = float(rng.uniform(1e-3, 0.05)), float(rng.choice([0.0, 3e-3, 0.02]))
-    told = decay_rate(bandwidth, damping, period, lag, by_speed)
-    seconds = min(max(20.0 / max(abs(told), 1e-3), 60.0 * period), 2000.0 * period)
+    predicted = decay_rate(bandwidth, damping, period, lag, by_speed)
+    seconds = min(max(20.0 / max(abs(predicted), 1e-3), 60.0 * period), 2000.0 * period)
     errors = np.empty(round(seconds / period))
     simulate(bandwidth, damping, period, by_speed, errors,
              np.array([motors_of(with_lag(prototype, lag))]))
-    # Envelopes over the first and the last fifth: peaks, since errors swing.
+    # The envelope of oscillating errors is the peak in the first and in the last fifth.
     fifth = errors.size // 5
     first, last = (np.log(errors[part].max()) for part in (
         slice(fifth, 2 * fifth), slice(-fifth, None)))
     apart = period * (errors.size - 2 * fifth)
     found = (first - last) / apart
-    # Peaks are met to within a swing, and the beginning has other modes in it: a factor of ten.
-    assert abs(found - told) < 0.05 * abs(told) + np.log(10.0) / apart, f'seed {seed}'
+    # The sampled peaks and the other modes at the begin cause a factor of at most ten.
+    assert abs(found - predicted) < 0.05 * abs(predicted) + np.log(10.0) / apart, f'seed {seed}'
     settings = unchecked(bandwidth=bandwidth, damping=damping, branch_bandwidth=0.0,
                          command='velocity' if by_speed else 'effort')
     with suppress(GainError):
@@ -113,7 +113,7 @@ def test_refusal_has_the_largest_bandwidth_that_is_accepted(
     damping: float, period: float, lag: float, by_speed: bool, prototype: Mechanism,
     refuses: Refuses,
 ) -> None:
-    """A little less is accepted, a little more is not."""
+    """A slightly smaller bandwidth is accepted, a slightly larger one is refused."""
     mechanism = with_lag(prototype, lag)
     others = {'damping': damping, 'branch_bandwidth': 0.0,
               'command': 'velocity' if by_speed else 'effort'}
@@ -126,7 +126,7 @@ def test_refusal_has_the_largest_bandwidth_that_is_accepted(
 
 
 @pytest.mark.parametrize('by_speed', [False, True])
-def test_limit_is_where_errors_fall_at_a_fifth_of_what_is_meant(by_speed: bool) -> None:
+def test_limit_is_a_decay_rate_of_a_fifth_of_the_nominal_one(by_speed: bool) -> None:
     largest = largest_bandwidth(0.9, 0.01, 3e-3, by_speed)
     assert decay_rate(largest, 0.9, 0.01, 3e-3, by_speed) == pytest.approx(
         MIN_DECAY * 0.9 * largest, rel=0.02)
@@ -140,8 +140,8 @@ def test_branch_is_checked_as_well_and_named(
     check_gains(ControllerSettings(branch_bandwidth=0.0), prototype, 4e-3)
 
 
-def test_slow_gains_are_as_fast_as_they_are_meant_to_be() -> None:
-    """Without lag, sampled fast: the real part of the poles of the double integrator."""
+def test_slow_gains_have_the_nominal_decay_rate() -> None:
+    """The nominal decay rate is the real part of the poles of the double integrator."""
     for damping in (0.3, 0.9, 1.0):
         assert decay_rate(1.0, damping, 1e-4, 0.0, False) == pytest.approx(damping, rel=0.02)
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Torques of the law, in the equations of motion of all four links."""
+"""Torques of the tracking law in the equations of motion of all four links."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ each_seed = pytest.mark.parametrize('seed', SEEDS)
 
 
 def without_limits(mechanism: Mechanism) -> Mechanism:
-    """Give motors that bear everything; finite, as `bounded` needs them."""
+    """Return a linkage with very large motor limits; `bounded` needs finite ones."""
     return replace(
         mechanism, motor_torque_limits=np.full(4, 1e3), motor_speed_limits=np.full(4, 1e9),
         motor_voltages=np.full(4, np.inf))
@@ -45,7 +45,7 @@ def without_limits(mechanism: Mechanism) -> Mechanism:
 
 def reference_at(mechanism: Mechanism, angles: Array, rates: Array, accelerations: Array
                  ) -> ReferenceGenerator:
-    """Make a reference that is on a move."""
+    """Make a reference in motion."""
     reference = ReferenceGenerator(mechanism)
     reference.rest_at(angles)
     reference.angles[:] = angles
@@ -72,15 +72,15 @@ def update(law: TrackingLaw, reference: ReferenceGenerator, angles: Array, rates
     return law.update(reference, angles, rates, disturbance, speeds, friction, sticking)
 
 
-# In the plant
+# Accelerations of the links
 
 @pytest.mark.parametrize('target', ['free', 'balanced', 'zero', 'bias'])
 @pytest.mark.parametrize('allocation', ALLOCATIONS)
 @each_seed
-def test_links_accelerate_exactly_as_asked(
+def test_links_have_the_demanded_accelerations(
     seed: int, allocation: str, target: str, uneven: Mechanism, accelerations: Accelerations,
 ) -> None:
-    """Any pose and motion; whatever the wheels do among themselves moves nothing."""
+    """Null-space torques have no effect in any pose and motion."""
     rng = np.random.default_rng(seed)
     mechanism = without_limits(uneven)
     phi_a = rng.uniform(-3.0, 3.0)
@@ -96,7 +96,7 @@ def test_links_accelerate_exactly_as_asked(
     asked = planned + DAMPING * slower + STIFFNESS * behind
     given = accelerations(mechanism, angles, rates, found.torques)
     np.testing.assert_allclose(given[:2], asked[:2], rtol=1e-9, atol=1e-9, err_msg=f'seed {seed}')
-    # The plan alone, likewise.
+    # The planned torques give the planned accelerations.
     np.testing.assert_allclose(
         accelerations(mechanism, angles, rates, found.planned)[:2], planned[:2], rtol=1e-9,
         atol=1e-9, err_msg=f'seed {seed}')
@@ -104,10 +104,10 @@ def test_links_accelerate_exactly_as_asked(
 
 @pytest.mark.parametrize('linkage', ['paper', 'prototype', 'parallelogram'])
 @each_seed
-def test_pairs_accelerate_exactly_as_asked(
+def test_pairs_have_the_demanded_accelerations(
     seed: int, linkage: str, request: pytest.FixtureRequest, accelerations: Accelerations,
 ) -> None:
-    """On the branch, whether it is held there or by the closure."""
+    """The pairs stay on the branch by the hold and by the closure."""
     rng = np.random.default_rng(seed)
     mechanism = without_limits(request.getfixturevalue(linkage))
     theta = rng.choice([rng.uniform(0.4, 2.7), rng.uniform(0.02, 0.3), pi - 0.01])
@@ -117,7 +117,7 @@ def test_pairs_accelerate_exactly_as_asked(
     found = update(law_of(mechanism, wheel_target='zero'), reference, angles, rates,
                    speeds=rng.uniform(-100.0, 100.0, 4))
     asked = planned - DAMPING * rates + STIFFNESS * behind
-    # Next to a change point the joint forces are large, and so is what rounding makes of them.
+    # Next to a change point the joint forces are large, and their rounding errors too.
     np.testing.assert_allclose(
         accelerations(mechanism, angles, rates, found.torques), asked, rtol=1e-7, atol=1e-7,
         err_msg=f'seed {seed}')
@@ -126,11 +126,11 @@ def test_pairs_accelerate_exactly_as_asked(
 @pytest.mark.parametrize('wheels', [(0, 1, 2, 3), (1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])
 @pytest.mark.parametrize('theta', [0.0, pi])
 @pytest.mark.parametrize('linkage', ['paper', 'prototype', 'parallelogram'])
-def test_eta_accelerates_exactly_as_asked_at_a_change_point(
+def test_eta_has_the_demanded_acceleration_at_a_change_point(
     linkage: str, theta: float, wheels: tuple[int, ...], request: pytest.FixtureRequest,
     accelerations: Accelerations,
 ) -> None:
-    """With four wheels and with three, and the pairs as if nothing were the matter with eta."""
+    """With four wheels or three, the accelerations of the pairs do not depend on eta."""
     mechanism = without_limits(request.getfixturevalue(linkage))
     angles, rates = 0.3 + np.array([0.0, theta, 0.0, theta]), np.tile([0.2, -0.5], 2)
     law = law_of(mechanism, np.isin(range(4), wheels), branch_bandwidth=8.0)
@@ -149,10 +149,10 @@ def test_eta_accelerates_exactly_as_asked_at_a_change_point(
 
 @pytest.mark.parametrize('wheels', [(0, 1), (2, 3), (0, 3)])
 @pytest.mark.parametrize('theta', [0.0, pi])
-def test_two_wheels_leave_eta_alone(
+def test_two_wheels_do_not_control_eta(
     theta: float, wheels: tuple[int, ...], paper: Mechanism, accelerations: Accelerations,
 ) -> None:
-    """They drive the axes as asked, and whatever is off with the branch does not disturb that."""
+    """They drive the axes as demanded, independent of errors of eta."""
     mechanism = without_limits(paper)
     angles, planned = 0.3 + np.array([0.0, theta, 0.0, theta]), np.tile([0.7, -0.4], 2)
     law = law_of(mechanism, np.isin(range(4), wheels))
@@ -169,7 +169,7 @@ def test_two_wheels_leave_eta_alone(
 @pytest.mark.parametrize('branch', BRANCHES[1:], ids=lambda branch: branch.name)
 @pytest.mark.parametrize('linkage', ['paper', 'prototype'])
 @each_seed
-def test_twins_of_other_branches_accelerate_exactly_as_asked(
+def test_pairs_of_other_branches_have_the_demanded_accelerations(
     seed: int, linkage: str, branch: Branch, request: pytest.FixtureRequest,
     accelerations: Accelerations,
 ) -> None:
@@ -186,7 +186,7 @@ def test_twins_of_other_branches_accelerate_exactly_as_asked(
     found = update(law_of(mechanism, wheel_target='zero'), reference, angles, rates,
                    speeds=rng.uniform(-100.0, 100.0, 4))
     asked = planned - DAMPING * rates + STIFFNESS * behind
-    # As on the parallelogram, next to a change point joint forces make much of rounding.
+    # Next to a change point the joint forces are large, and their rounding errors too.
     np.testing.assert_allclose(
         accelerations(mechanism, angles, rates, found.torques), asked, rtol=1e-7, atol=1e-7,
         err_msg=f'seed {seed}')
@@ -194,10 +194,10 @@ def test_twins_of_other_branches_accelerate_exactly_as_asked(
 
 @pytest.mark.parametrize('usable', [4, 3])
 @pytest.mark.parametrize('linkage', ['paper', 'parallelogram'])
-def test_torques_change_without_a_corner_where_the_hold_fades(
+def test_torques_are_smooth_where_the_hold_decreases(
     linkage: str, usable: int, request: pytest.FixtureRequest,
 ) -> None:
-    """Second differences go with the square of the step; those of a corner with the step."""
+    """Second differences of a smooth function are quadratic in the step, of a corner linear."""
     mechanism = without_limits(request.getfixturevalue(linkage))
     law = law_of(mechanism, np.arange(4) < usable, wheel_target='balanced')
 
@@ -214,10 +214,10 @@ def test_torques_change_without_a_corner_where_the_hold_fades(
 
 
 @each_seed
-def test_compensated_disturbance_leaves_nothing_behind(
+def test_compensated_disturbance_has_no_effect(
     seed: int, uneven: Mechanism, accelerations: Accelerations,
 ) -> None:
-    """Of torques on links a and b the wheels take as large a share as they are told to."""
+    """The wheels take the given share of torques on links a and b."""
     rng = np.random.default_rng(seed)
     mechanism, share = without_limits(uneven), float(rng.uniform(0.0, 1.0))
     angles = assemble(mechanism, 0.1, 0.1 + rng.uniform(0.9, 2.0))
@@ -234,8 +234,8 @@ def test_compensated_disturbance_leaves_nothing_behind(
 
 @pytest.mark.parametrize('name', ['paper', 'prototype'])
 @each_seed
-def test_motors_can_give_what_lies_within_their_bounds(seed: int, name: str) -> None:
-    """By the law of the plant, friction included; zero always does."""
+def test_motors_can_give_all_torques_within_their_bounds(seed: int, name: str) -> None:
+    """The test uses the motor law of the plant with friction; zero is always within the bounds."""
     rng = np.random.default_rng(seed)
     mechanism = load_mechanism(name)
     motors = motors_of(mechanism)
@@ -253,10 +253,10 @@ def test_motors_can_give_what_lies_within_their_bounds(seed: int, name: str) -> 
                 continue
             asked = torque + friction[wheel]
             assert available_torque(wheel, asked, speeds[wheel], motors) == asked, f'seed {seed}'
-            # It is not driven past its limit before the horizon, and beyond it not outwards.
+            # The speed stays within its limit for the horizon, and no excess increases.
             reached = speeds[wheel] + HORIZON * torque / inertias[wheel]
             assert abs(reached) <= max(limits[wheel], abs(speeds[wheel])) * (1.0 + 1e-12)
-    # Far from both limits nothing but the share is kept back.
+    # Far from the limits the bounds are the share of the motor limit.
     motor_bounds(np.zeros(4), NONE, share, motors, lower, upper)
     largest = np.minimum(mechanism.motor_torque_limits, inertias / HORIZON * limits)
     np.testing.assert_allclose(upper, np.minimum(
@@ -267,10 +267,10 @@ def test_motors_can_give_what_lies_within_their_bounds(seed: int, name: str) -> 
 @pytest.mark.parametrize('target', ['free', 'bias'])
 @pytest.mark.parametrize('allocation', ALLOCATIONS)
 @each_seed
-def test_bounds_are_kept_with_everything_on_top(
+def test_bounds_are_kept_with_all_contributions(
     seed: int, allocation: str, target: str, prototype: Mechanism,
 ) -> None:
-    """Errors beyond what the motors can do, next to a change point or not."""
+    """The errors exceed the capacity of the motors, near and far from change points."""
     rng = np.random.default_rng(seed)
     theta = rng.choice([0.02, 0.2, 0.3, 1.2])
     angles = np.array([0.0, theta, 0.0, theta])
@@ -288,8 +288,8 @@ def test_bounds_are_kept_with_everything_on_top(
     assert (np.abs(found.torques + friction) <= prototype.motor_torque_limits).all()
 
 
-def test_plan_asks_for_nothing_that_feedback_does(prototype: Mechanism) -> None:
-    """A reference that stands still plans no torque, whatever the errors are."""
+def test_plan_contains_no_feedback(prototype: Mechanism) -> None:
+    """A reference at rest has no planned torque at any errors."""
     angles = np.array([0.0, 1.0, 0.0, 1.0])
     reference = reference_at(prototype, angles + 0.1, NONE, NONE)
     found = update(law_of(prototype), reference, angles, NONE)
@@ -297,7 +297,7 @@ def test_plan_asks_for_nothing_that_feedback_does(prototype: Mechanism) -> None:
     np.testing.assert_allclose(found.planned, 0.0, atol=1e-18)
 
 
-# What can be driven
+# Lost axes
 
 @pytest.mark.parametrize(('wheels', 'lost'), [
     ((0, 1, 2, 3), []), ((0, 1), []), ((2, 3), []), ((0, 3), []), ((1, 2, 3), []),
@@ -311,7 +311,7 @@ def test_axes_that_no_wheel_turns_are_lost(
     assert law.lost_axes() == lost
 
 
-def test_off_the_parallelogram_nothing_is_held(uneven: Mechanism) -> None:
+def test_no_branch_is_held_off_the_parallelogram(uneven: Mechanism) -> None:
     angles = assemble(uneven, 0.0, 1.0)
     found = update(law_of(uneven), reference_at(uneven, angles, NONE, NONE), angles, NONE)
     assert found.axes.hold == 0.0

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Points with times become one smooth motion through them, or are refused with their number."""
+"""Trajectories: smooth motions through points with times, and refusals with the number."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -31,7 +31,7 @@ def read(mechanism: Mechanism, names: Sequence[str], points: Sequence[Point],
 
 
 def draw(seed: int, count: int) -> tuple[Array, Array]:
-    """Draw times, and positions of a and b that keep away from change points."""
+    """Draw times, and positions of a and b away from change points."""
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.uniform(0.5, 3.0, count))
     phi_a = 0.2 + np.cumsum(rng.uniform(-0.5, 0.5, count))
@@ -39,17 +39,17 @@ def draw(seed: int, count: int) -> tuple[Array, Array]:
 
 
 def assert_smooth(trajectory: Trajectory) -> None:
-    """Angle, rate and acceleration are continuous, each the derivative of the one before."""
+    """Check that angle, rate and acceleration are continuous derivatives of each other."""
     duration, width = trajectory.duration, 1e-5
     times = trajectory.instants(5000)
     motion = trajectory.sample(times)
-    # Largest derivatives: of the acceleration itself a fine difference, with a margin.
+    # Largest derivatives; the jerk is a fine difference of the acceleration with a margin.
     steepest = max(1.0, 1.5 * (np.abs(np.diff(motion[:, 2], axis=0)).max(axis=1)
                                / np.diff(times)).max(), np.abs(motion[:, 1:]).max())
     for time in [*trajectory.times[1:-1], *np.linspace(width, duration - width, 101)]:
         before, now, after = (trajectory.at(time + shift) for shift in (-width, 0.0, width))
         assert np.abs(after - before).max() < 2.0 * width * steepest
-        # The jerk may jump at a point, so slopes are off by a jerk times the width; and rounding.
+        # The jerk may jump at a point, so the error of a slope is jerk times width, and rounding.
         np.testing.assert_allclose(
             ((after - before) / (2.0 * width))[:2], now[1:], atol=steepest * width + 1e-9)
     np.testing.assert_array_equal(trajectory.at(duration)[1:], 0.0)
@@ -58,7 +58,7 @@ def assert_smooth(trajectory: Trajectory) -> None:
                   ).max() < width * steepest
 
 
-# What is given
+# Given points
 
 @pytest.mark.parametrize('seed', range(10))
 @pytest.mark.parametrize('given', ['positions', 'velocities', 'accelerations'])
@@ -102,15 +102,15 @@ def test_points_with_and_without_rates_may_be_mixed(paper: Mechanism) -> None:
     assert_smooth(trajectory)
 
 
-def test_between_the_points_it_bends_no_more_than_it_must(paper: Mechanism) -> None:
-    """Points on a cubic that begins and ends as the motion does: it is that cubic."""
+def test_motion_through_points_on_a_cubic_is_the_cubic(paper: Mechanism) -> None:
+    """The cubic has the same rates and accelerations at begin and end."""
     times = np.arange(0.0, 6.5, 1.0)
     cubic = (0.5 * (times / 6.0) ** 2 * (3.0 - 2.0 * times / 6.0))[:, None] + MOVING[0]
     start = np.array([MOVING[0], np.zeros(2), np.full(2, 3.0 / 36.0)])
     trajectory, _ = read(paper, A_AND_B, [
         Point(position.tolist(), float(time)) for position, time in zip(cubic[1:], times[1:])],
         start)
-    # The last piece also brings the acceleration to rest.
+    # The last piece differs, since the acceleration ends at zero.
     for time in np.linspace(0.0, 5.0, 41):
         s = time / 6.0
         np.testing.assert_allclose(
@@ -128,7 +128,7 @@ def test_replanning_takes_over_angle_rate_and_acceleration(paper: Mechanism) -> 
         np.testing.assert_allclose(new.at(0.0), now, rtol=0.0, atol=1e-15)
 
 
-def test_samples_are_the_motion_and_reach_into_every_piece(paper: Mechanism) -> None:
+def test_samples_agree_with_the_motion_in_every_piece(paper: Mechanism) -> None:
     points = [Point((0.3, 1.6), 1.0, (0.0, 0.0)), Point((0.31, 1.6), 1.01, (0.0, 0.0)),
               Point((0.4, 1.7), 50.0)]
     trajectory, _ = read(paper, A_AND_B, points)
@@ -141,8 +141,8 @@ def test_samples_are_the_motion_and_reach_into_every_piece(paper: Mechanism) -> 
         trajectory.sample(times), [trajectory.at(time) for time in times], rtol=0.0, atol=1e-12)
 
 
-def test_short_piece_does_not_make_a_long_one_swing_out(paper: Mechanism) -> None:
-    """The short one needs 100 times the acceleration that the long one bears."""
+def test_short_piece_causes_no_overshoot_of_a_long_one(paper: Mechanism) -> None:
+    """The short piece needs 100 times the acceleration of the long one."""
     trajectory, _ = read(paper, A_AND_B, [
         Point((0.3, 1.6), 1.0, (0.0, 0.0)), Point((0.31, 1.6), 1.1, (0.0, 0.0)),
         Point((0.4, 1.7), 50.0)])
@@ -151,10 +151,10 @@ def test_short_piece_does_not_make_a_long_one_swing_out(paper: Mechanism) -> Non
     assert (path.max(axis=0) < [0.41, 1.71]).all()
 
 
-# Which links
+# Named links
 
 def motion(time: float) -> Array:
-    """Move (phi_a, phi_b) somehow."""
+    """Return smooth angles (phi_a, phi_b)."""
     return np.array([0.2 + 0.3 * np.sin(0.5 * time), 1.5 + 0.2 * np.sin(0.7 * time)])
 
 
@@ -165,10 +165,10 @@ LINKS = [*combinations(range(4), 2), (0, 1, 2), (3, 1, 0), (0, 2, 3), (0, 1, 2, 
     *(('uneven', branch, links) for branch in ('open', 'crossed') for links in LINKS),
     # Parallel links alone do not determine a rhombus.
     *(('paper', 'open', links) for links in LINKS if links not in ((0, 2), (1, 3)))], ids=str)
-def test_any_links_that_determine_the_rest_say_the_same(
+def test_any_determining_links_give_the_same_motion(
     linkage: str, branch: str, links: tuple[int, ...], request: pytest.FixtureRequest,
 ) -> None:
-    """Angles, rates and accelerations of any of the four, by differences of the closure."""
+    """The reference for angles, rates and accelerations is differences of the closure."""
     mechanism = request.getfixturevalue(linkage)
     width = 1e-4
 
@@ -186,8 +186,8 @@ def test_any_links_that_determine_the_rest_say_the_same(
     start = np.array([motion(0.0), np.zeros(2), np.zeros(2)])
     trajectory, end = read(mechanism, [LINK_NAMES[link] for link in links], points, start, branch)
     for time, state in zip((0.5, 1.3, 2.0), states):
-        # Differences are off by width^2 times some derivatives, and rounding over width^2; a
-        # Gamma of up to 10 makes more of it.
+        # The errors of differences are width^2 times derivatives, and rounding over width^2, times
+        # a Gamma of up to 10.
         np.testing.assert_allclose(trajectory.at(time)[0], state[0], atol=1e-9)
         np.testing.assert_allclose(trajectory.at(time)[1], state[1], atol=1e-6)
         np.testing.assert_allclose(trajectory.at(time)[2], state[2], atol=3e-6)
@@ -215,18 +215,18 @@ def test_one_link_moves_and_its_neighbour_holds(
     assert rates[holds] == pytest.approx(0.0, abs=1e-8)
 
 
-def test_from_point_to_point_links_take_the_shortest_way(paper: Mechanism) -> None:
+def test_links_take_the_shortest_path_between_points(paper: Mechanism) -> None:
     start = np.array([[2.9, 4.2], [0.0, 0.0], [0.0, 0.0]])
     angles = np.array([3.1, -3.0, -2.5, 3.0 + 4 * pi])
     points = [Point((angle, angle + 1.3), float(n + 1)) for n, angle in enumerate(angles)]
     _, end = read(paper, A_AND_B, points, start)
-    # By 0.2, 0.183, 0.5 and -0.783.
+    # The steps of link b are 0.2, 0.183, 0.5 and -0.783.
     np.testing.assert_allclose(end, [3.0, 4.3, 3.0, 4.3 - 2 * pi], atol=1e-9)
     trajectory, _ = read(paper, A_AND_B, points[:3], start)
     np.testing.assert_allclose(trajectory.at(3.0)[0, 0], 2 * pi - 2.5, atol=1e-9)
 
 
-def test_first_point_at_time_0_is_where_it_is(paper: Mechanism, refuses: Refuses) -> None:
+def test_first_point_at_time_0_is_the_reference(paper: Mechanism, refuses: Refuses) -> None:
     there = Point((0.2005 + 2 * pi, 1.5), 0.0)
     rest = [Point((0.3, 1.6), 2.0), Point((0.4, 1.6), 4.0)]
     with_it, _ = read(paper, A_AND_B, [there, *rest])
@@ -239,10 +239,10 @@ def test_first_point_at_time_0_is_where_it_is(paper: Mechanism, refuses: Refuses
 # Change points
 
 @pytest.mark.parametrize('names', [('link_a', 'link_b'), ('link_d', 'link_c'), ('link_b',)])
-def test_where_allowed_it_crosses_change_points(
+def test_trajectory_crosses_change_points_where_allowed(
     names: Sequence[str], paper: Mechanism, refuses: Refuses,
 ) -> None:
-    """There and back through theta = 0, with a point on it that is passed at a given rate."""
+    """The trajectory passes theta = 0 twice, once at a point with a given rate."""
     start = np.array([[0.2, 0.8], [0.0, 0.0], [0.0, 0.0]])
     axes = [LINK_NAMES.index(name) % 2 for name in names]
     points = [Point([(0.2, angle)[axis] for axis in axes], time,
@@ -303,7 +303,7 @@ GOOD = Point((0.3, 1.6), 1.0)
      {'point': 1, 'name': 'velocity', 'link': 'link_c', 'value': pytest.approx(0.1),
       'limit': 0.2}),
 ])
-def test_refused_with_its_values(
+def test_invalid_trajectory_is_refused_with_its_values(
     names: Sequence[str], points: Sequence[Any], values: dict[str, Any], paper: Mechanism,
     refuses: Refuses,
 ) -> None:
@@ -311,7 +311,7 @@ def test_refused_with_its_values(
         read(paper, names, points)
 
 
-def test_what_the_linkage_cannot_take_is_refused(uneven: Mechanism, refuses: Refuses) -> None:
+def test_impossible_motion_is_refused(uneven: Mechanism, refuses: Refuses) -> None:
     other = assemble(uneven, 0.2, 1.5, 'crossed')
     with refuses(SetpointError, point=1):
         read(uneven, LINK_NAMES[:3], [Point(other[:3].tolist(), 1.0)])

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Wheel commands: wheels gain the demanded momentum in spite of bearing friction."""
+"""Wheel commands: wheels gain the demanded momentum despite bearing friction."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def plant_with(mechanism: Mechanism, bearings: WheelBearings) -> Plant:
 
 
 def momenta(mechanism: Mechanism, plant: Plant) -> Array:
-    """Return what the wheels hold, absolute (4,) [N m s]."""
+    """Return the absolute momentum of the wheels (4,) [N m s]."""
     truth = plant.truth()
     return mechanism.flywheel_inertias * (truth.wheel_speeds + truth.link_rates)
 
@@ -44,7 +44,7 @@ def drive_for(plant: Plant, drive: WheelCommander, torques: Array, seconds: floa
     commands, rates = [], plant.truth().link_rates
     for _ in range(round(seconds / PERIOD)):
         truth = plant.truth()
-        # Free links accelerate as the wheels push them; of the last period that is exact enough.
+        # The acceleration of the free links in the last period is accurate enough.
         acceleration, rates = (truth.link_rates - rates) / PERIOD, truth.link_rates
         drive.update_friction(
             truth.wheel_speeds, settings.bearing_coulomb, settings.bearing_viscous)
@@ -58,35 +58,35 @@ TORQUES = np.array([2e-3, -1.5e-3, 1e-3, -3e-3])
 
 
 @pytest.mark.parametrize('bearings', [WheelBearings(), RUBBING], ids=['smooth', 'rubbing'])
-def test_commanded_speeds_make_wheels_gain_the_momentum_asked_for(
+def test_commanded_speeds_give_the_demanded_momentum(
     bearings: WheelBearings, prototype: Mechanism,
 ) -> None:
-    """From standstill: what the bearings take, the motors' own loop gives besides."""
+    """From standstill, the speed loop of the motors compensates the friction."""
     plant, drive = plant_with(prototype, bearings), WheelCommander(prototype)
     drive.reset(np.zeros(4))
     drive_for(plant, drive, TORQUES, 2.0, True, ControllerSettings())
     gained = momenta(prototype, plant)
-    # It follows a ramp with its speed late by no more than 4 a / bandwidth^2 times the friction
-    # of the way in; in 2 s that is less than 2 periods of the torque.
+    # The speed lags a ramp by at most 4 a / bandwidth^2 times the initial friction transient,
+    # which is less than 2 periods of the torque.
     np.testing.assert_allclose(gained, TORQUES * 2.0, atol=2.0 * PERIOD * np.abs(TORQUES).max())
 
 
 def test_commanded_torques_have_the_friction_added(prototype: Mechanism) -> None:
-    """Known bearings, once turning: the momentum comes as asked, and does not without."""
+    """Turning wheels gain the demanded momentum only with known bearings."""
     bearings = replace(RUBBING, static_ratio=1.0)
     known = ControllerSettings(bearing_coulomb=bearings.coulomb, bearing_viscous=bearings.viscous)
     for settings, gained_share in ((known, 1.0), (ControllerSettings(), 0.5)):
         plant, drive = plant_with(prototype, bearings), WheelCommander(prototype)
         plant.advance(1000, 2.0 * TORQUES + np.copysign(2e-3, TORQUES))
         assert np.abs(plant.truth().wheel_speeds).min() > 10.0 * FRICTION_SPEED
-        # Until the motors give what they are told and no longer what they were.
+        # The transient of the motor lag ends.
         drive_for(plant, drive, TORQUES, 0.1, False, settings)
         before = momenta(prototype, plant)
         commands = drive_for(plant, drive, TORQUES, 1.0, False, settings)
         gained = (momenta(prototype, plant) - before) / TORQUES
         assert not any(command.by_speed for command in commands)
         if gained_share == 1.0:
-            # Viscous friction grows by 2e-6 * 25 rad/s a second, of which a period is missed.
+            # Viscous friction grows by 2e-6 * 25 rad/s a second; its compensation is late by T.
             np.testing.assert_allclose(gained, 1.0, atol=1e-3)
         else:
             assert (gained < 0.7).all()
@@ -99,7 +99,7 @@ def test_friction_has_the_sign_of_the_speed_above_a_small_speed(prototype: Mecha
         drive.update_friction(speeds, 1e-3, 2e-6),
         [0.0, 2.5e-4 + 2e-6 * 0.25 * FRICTION_SPEED, -1e-3 - 2e-6 * FRICTION_SPEED,
          1e-3 + 2e-4], rtol=1e-12)
-    # Dissipative, odd, and without a jump.
+    # The friction is dissipative, odd and continuous.
     sweep = np.linspace(-2.0, 2.0, 4001)
     friction = np.array([
         drive.update_friction(np.full(4, speed), 1e-3, 2e-6)[0] for speed in sweep])
@@ -108,7 +108,7 @@ def test_friction_has_the_sign_of_the_speed_above_a_small_speed(prototype: Mecha
     assert np.abs(np.diff(friction)).max() <= (1e-3 / FRICTION_SPEED + 2e-6) * 1.001e-3
 
 
-def test_motors_are_not_asked_for_more_than_their_limit(prototype: Mechanism) -> None:
+def test_commanded_torques_are_within_the_motor_limits(prototype: Mechanism) -> None:
     drive = WheelCommander(prototype)
     drive.update_friction(np.full(4, 100.0), 1e-3, 0.0)
     command = drive.command(np.array([0.05, -0.05, 0.02, 0.0]), NONE, NONE, ALL, PERIOD, False)
@@ -116,11 +116,11 @@ def test_motors_are_not_asked_for_more_than_their_limit(prototype: Mechanism) ->
 
 
 @pytest.mark.parametrize('speed', [0.0, 120.0, -40.0])
-def test_speeds_start_where_the_wheels_are(speed: float, prototype: Mechanism) -> None:
-    """No torque asked for, none given, however fast they turn: bumpless."""
+def test_speed_commands_start_at_the_wheel_speeds(speed: float, prototype: Mechanism) -> None:
+    """A zero demand causes no torque at any speed."""
     plant, drive = plant_with(prototype, WheelBearings()), WheelCommander(prototype)
     plant.advance(1000, np.full(4, speed), True)
-    # More than 30 time constants of the motors.
+    # The time is more than 30 time constants of the motors.
     plant.advance(200, np.zeros(4))
     before = momenta(prototype, plant)
     truth = plant.truth()
@@ -131,7 +131,7 @@ def test_speeds_start_where_the_wheels_are(speed: float, prototype: Mechanism) -
     np.testing.assert_allclose(momenta(prototype, plant), before, rtol=1e-9, atol=1e-12)
 
 
-def test_change_from_torques_to_speeds_goes_on_from_what_is_measured(prototype: Mechanism
+def test_change_from_torques_to_speeds_starts_at_the_measured_speeds(prototype: Mechanism
                                                                      ) -> None:
     drive = WheelCommander(prototype)
     drive.reset(np.full(4, 500.0))
@@ -141,8 +141,8 @@ def test_change_from_torques_to_speeds_goes_on_from_what_is_measured(prototype: 
         drive.command(NONE, NONE, speeds, ALL, PERIOD, True).values, speeds)
 
 
-def test_speeds_run_ahead_no_further_than_the_motor_can_follow(prototype: Mechanism) -> None:
-    """A wheel that does not follow is asked for most of its torque, and winds nothing up."""
+def test_speed_commands_lead_by_no_more_than_the_motor_can_follow(prototype: Mechanism) -> None:
+    """The command of a blocked wheel demands most of its torque and does not wind up."""
     drive, speeds = WheelCommander(prototype), np.full(4, 20.0)
     drive.reset(speeds)
     for _ in range(1000):
@@ -154,8 +154,8 @@ def test_speeds_run_ahead_no_further_than_the_motor_can_follow(prototype: Mechan
     assert (np.sign(back.values - command.values) == -np.sign(TORQUES)).all()
 
 
-def test_links_that_accelerate_take_their_wheels_along(prototype: Mechanism) -> None:
-    """A wheel without torque keeps its absolute speed: relative to its link it falls behind."""
+def test_speed_commands_include_the_acceleration_of_the_links(prototype: Mechanism) -> None:
+    """A wheel without torque keeps its absolute speed, so its relative speed changes."""
     drive, acceleration = WheelCommander(prototype), np.array([1.0, -2.0, 0.5, 0.0])
     drive.reset(NONE)
     for _ in range(5):
@@ -165,7 +165,7 @@ def test_links_that_accelerate_take_their_wheels_along(prototype: Mechanism) -> 
 
 # Without power
 
-def test_wheel_without_power_is_not_named_and_wound_up(prototype: Mechanism) -> None:
+def test_wheel_without_power_is_missing_and_does_not_wind_up(prototype: Mechanism) -> None:
     drive, powered = WheelCommander(prototype), np.array([True, False, True, True])
     drive.reset(NONE)
     for speed in (10.0, 8.0, 6.0):
