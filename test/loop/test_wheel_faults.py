@@ -175,7 +175,7 @@ def test_no_wheel_fault_with_wrong_inertias(command: str, scenario: Scenario) ->
         goal = (0.0, pi / 3.0 + pi / 4.0) if seed else (-pi / 2.0, -pi / 6.0)
         setpoint = replace(scenario.setpoints[0], names=LINK_NAMES[:2], positions=goal)
         story = run(replace(scenario, model=model, setpoints=(setpoint,), seed=seed),
-                     command, 0.5)
+                    command, 0.5)
         assert story.named == {}, f'seed {seed}'
         assert story.final < 0.1, f'seed {seed}'
 

@@ -32,7 +32,7 @@ def test_moving_testbed_ends_cleanly(suite, make_probe, number):
     probe.wait(lambda: probe.arm().success)
     probe.status('controller_status', mode='hold')
     probe.setpoint_decision(JointState(name=['link_a'], position=[0.5]),
-                           probe.publisher(JointState, 'setpoint'))
+                            probe.publisher(JointState, 'setpoint'))
     probe.wait(lambda: any(probe.received['flywheel_command'][-1].effort))
 
     assert nodes['controller'].end(number, SHUTDOWN_S) == 0
