@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The bags of known motions, for the tests of this folder."""
+"""Bags of known motions for the tests of this folder."""
 
 from dataclasses import replace
 
@@ -18,11 +18,11 @@ def motion_bag(synthetic, tmp_path_factory):
 
 @pytest.fixture(scope='session')
 def loop_messages(synthetic):
-    """Return what the nodes publish on a table with late and lossy sensors."""
+    """Return the messages of the nodes for a table with latency and dropout of sensors."""
     return synthetic.closed_loop_messages(replace(load_scenario('prototype'), duration=1.6))
 
 
 @pytest.fixture(scope='session')
 def loop_bag(synthetic, loop_messages, tmp_path_factory):
-    """Return the bag of it."""
+    """Return the bag of these messages."""
     return synthetic.write_bag(tmp_path_factory.mktemp('loop') / 'bag', loop_messages)

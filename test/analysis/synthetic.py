@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Bags of a motion whose every metric is known on paper.
+Bags of a motion with known values of all metrics.
 
 Links a and b of a rhombus (c = a, d = b) turn by `TURN_RAD` in 10 s. The reference is a quintic;
 truth, estimate and wheels differ from it by sines with whole periods in the step, so that root
@@ -22,7 +22,7 @@ JOINT_STATE = 'sensor_msgs/msg/JointState'
 STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
-# Simulated time starts at 1 s; the recorder's clock has nothing to do with it.
+# Simulated time is independent of the clock of the recorder.
 START_NS = 3_000_000_000
 RECORDER_OFFSET_NS = 1_700_000_000_000_000_000
 HOLD_S, STEP_S, AFTER_S = 1.0, 10.0, 2.0
@@ -32,7 +32,7 @@ TRACKING_RAD = np.array([0.01, 0.02, 0.01, 0.02])
 FINAL_RAD = np.array([0.002, -0.005, 0.002, -0.005])
 ESTIMATE_RAD = 0.003
 SIGMA_RAD = 0.0018
-# Of an absolute wheel speed proportional to the link's: the paper's rhombus, four wheels.
+# Absolute wheel speed over link rate: rhombus of the paper, four wheels.
 WHEEL_RATIO = -211.76
 
 
@@ -95,7 +95,7 @@ def signals(rate_hz):
     reference_rate = np.tile(TURN_RAD * speed[:, None], 4)
     truth = reference + TRACKING_RAD * error[:, None] + FINAL_RAD * after[:, None]
     truth_rate = reference_rate + TRACKING_RAD * error_rate[:, None]
-    # Not zero after the step: the rms is to be that of a sine there as well.
+    # The error continues after the step, so that its rms is that of a sine for all times.
     estimate = truth + ESTIMATE_RAD * np.sin(2 * np.pi * 3 * seconds)[:, None]
     return {'seconds': seconds, 'reference': (reference, reference_rate),
             'truth': (truth, truth_rate), 'estimate': (estimate, truth_rate)}
@@ -119,7 +119,7 @@ def motion_messages(rate_hz=50, namespace='', seed=0, mechanism='paper'):
     add('controller_status', begin + 1, status(mode='hold', setpoint_duration_s='10.0'))
     for row, second in enumerate(known['seconds']):
         stamp = START_NS + round(second * 1e9)
-        # The recorder runs at another speed than simulated time, and not evenly.
+        # Log times have another rate than simulated time, and jitter.
         now = begin + 1000 + row * 1_000_000 + int(rng.integers(400_000))
         if second == 0.0:
             add('setpoint', now - 500_000, joint_state(
@@ -164,9 +164,9 @@ def timing(stamp, row, rng):
 
 def closed_loop_messages(scenario, namespace=''):
     """
-    Return what the nodes would publish in a run, as a recorder would get it.
+    Return the messages of the nodes in a run, with log times of a recorder.
 
-    Nothing here goes through the code that decides what the estimator publishes.
+    The code that makes the messages of the estimator node is not used here.
     """
     topics = {}
     now = RECORDER_OFFSET_NS

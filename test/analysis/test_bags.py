@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A bag comes back as it was written, or with one line that says why not."""
+"""Bags are read with all their values, or refused in one line with the reason."""
 
 from fourbar_ros.analysis.bag_reader import BagError
 from fourbar_ros.analysis.bags import JointSeries, read_bag
@@ -13,9 +13,9 @@ LINKS = ('link_a', 'link_b', 'link_c', 'link_d')
 
 
 @pytest.mark.parametrize('storage', list(StoragePlugin), ids=lambda plugin: plugin.name)
-def test_values_come_back_exactly(synthetic, tmp_path, storage):
+def test_values_are_read_exactly(synthetic, tmp_path, storage):
     values = np.random.default_rng(1).standard_normal((20, 3, 4))
-    stamps = 10**18 + np.arange(20) * 4_000_001  # beyond what a float holds
+    stamps = 10**18 + np.arange(20) * 4_000_001  # beyond the precision of a float
     bag = synthetic.write_bag(tmp_path / 'bag', {'/reference': [
         (row, synthetic.joint_state(stamps[row], LINKS, *values[row])) for row in range(20)]},
         storage)
@@ -28,7 +28,7 @@ def test_values_come_back_exactly(synthetic, tmp_path, storage):
         assert np.array_equal(array, values[:, index])
 
 
-def test_what_a_message_leaves_out_is_nan(synthetic, tmp_path):
+def test_missing_fields_are_nan(synthetic, tmp_path):
     bag = synthetic.write_bag(tmp_path / 'bag', {'/link_angles': [
         (1, synthetic.joint_state(1, ['link_b', 'link_d'], [2.0, 4.0])),
         (2, synthetic.joint_state(2, [], [])),
@@ -42,7 +42,7 @@ def test_what_a_message_leaves_out_is_nan(synthetic, tmp_path):
     assert np.all(np.isnan(series.velocity))
 
 
-def test_stamps_are_in_order_and_once_with_the_first_to_arrive(synthetic, tmp_path):
+def test_stamps_are_unique_and_in_order_with_the_first_message(synthetic, tmp_path):
     bag = synthetic.write_bag(tmp_path / 'bag', {'/reference': [
         (received, synthetic.joint_state(stamp, ['link_a'], [received]))
         for received, stamp in enumerate([30, 10, 20, 10, 30])]})
@@ -72,7 +72,7 @@ def test_namespace_is_found(recording_of):
     assert recording.joint_states('sim/flywheel_states').topic == '/lab/sim/flywheel_states'
 
 
-def test_ground_truth_never_stands_in_for_a_measurement(recording_of):
+def test_ground_truth_never_replaces_a_measurement(recording_of):
     recording = recording_of('/sim/flywheel_states')
     assert not recording.has('flywheel_states')
 
@@ -124,7 +124,7 @@ def test_a_path_without_a_bag_is_refused(refused, tmp_path):
     refused(tmp_path, 'not_a_bag')
 
 
-def test_bag_of_a_killed_recorder_comes_with_the_repair(synthetic, refused, tmp_path):
+def test_error_for_a_bag_of_a_killed_recorder_has_the_repair(synthetic, refused, tmp_path):
     bag = synthetic.write_bag(tmp_path / 'bag', {'/timing': []})
     (bag / 'metadata.yaml').unlink()
     refused(bag, 'no_metadata', repair=f'ros2 bag reindex -s mcap {bag}')
@@ -153,13 +153,13 @@ def test_broken_metadata_is_one_line(synthetic, refused, tmp_path, text):
     refused(bag, 'damaged')
 
 
-def test_what_lies_between_messages_is_on_a_straight_line_also_through_a_turn():
+def test_values_between_messages_are_interpolated_also_over_a_turn():
     stamps = np.array([0, 4, 8, 12, 40, 44]) * 1_000_000 + 1_700_000_000_000_000_000
     angles = np.array([3.1, 3.14, -3.1032, -3.0632, 0.0, 0.1])[:, None]
     series = JointSeries('/a', stamps, stamps, ('link_a',), angles, angles, angles)
     wanted = stamps[0] + np.array([-1, 0, 1, 6, 20, 42, 44, 45]) * 1_000_000
     found = series.interpolated(wanted)
-    # Before, after, at the first message, and in a gap there is nothing.
+    # There is no value before, after, at the first message, and in a gap.
     assert (found.stamp_ns - stamps[0]).tolist() == [1_000_000, 6_000_000, 42_000_000, 44_000_000]
     assert found.position[:2, 0] == pytest.approx([3.11, 3.16], abs=1e-4)
     assert np.remainder(found.position[2:, 0], 2 * np.pi) == pytest.approx([0.05, 0.1])

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Metrics of motions whose every number is known on paper (see synthetic.py)."""
+"""Metrics of motions with known values (see synthetic.py)."""
 
 import json
 
@@ -33,7 +33,7 @@ def motion_with(synthetic, tmp_path):
     return make
 
 
-def test_every_metric_is_there_and_goes_through_json(result):
+def test_every_metric_is_present_and_read_back_from_json(result):
     assert result['missing'] == {}
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     assert {f'{group}.{key}' for group in result if group not in ('motion', 'missing')
@@ -51,18 +51,18 @@ def test_motion_begins_at_the_tick_of_the_setpoint(result, synthetic):
 
 def test_tracking_is_that_of_a_sine(result, synthetic):
     amplitudes = synthetic.TRACKING_RAD[:2]
-    # 501 samples of whole periods: the last repeats the first, which is zero.
+    # The last of 501 samples of whole periods repeats the first, which is zero.
     expected = np.sqrt(np.mean(amplitudes**2) / 2 * 500 / 501)
     assert result['tracking']['rms_rad'] == pytest.approx(expected, rel=1e-9)
-    # A sample lies within half a period of sampling of the crest.
+    # A sample is within half a sampling period of the peak.
     crest = np.cos(2 * np.pi * 4 / synthetic.STEP_S / 50 / 2)
     assert crest * amplitudes.max() <= result['tracking']['peak_rad'] <= amplitudes.max()
 
 
-def test_final_error_is_the_larger_one_without_what_averages_out(result, synthetic):
+def test_final_error_is_the_mean_of_the_larger_one(result, synthetic):
     expected = np.max(np.abs(synthetic.FINAL_RAD))
     assert result['tracking']['final_error_rad'] == pytest.approx(expected, rel=1e-9)
-    # The estimate swings by 3 mrad about it in whole periods a second, one sample over.
+    # The estimate oscillates by 3 mrad in whole periods a second, with one further sample.
     assert result['tracking']['estimated_final_error_rad'] == pytest.approx(
         expected, abs=synthetic.ESTIMATE_RAD / 51)
 
@@ -70,7 +70,7 @@ def test_final_error_is_the_larger_one_without_what_averages_out(result, synthet
 def test_estimate_error_is_that_of_a_sine_over_all_time(result, synthetic):
     expected = synthetic.ESTIMATE_RAD * np.sqrt(0.5 * 600 / 601)
     assert result['estimate']['rms_error_rad'] == pytest.approx(expected, rel=1e-6)
-    # The band of 3.6 mrad holds a sine of 3 mrad whole.
+    # The sine of 3 mrad is within the band of 3.6 mrad.
     assert result['estimate']['within_2_sigma'] == 1.0
 
 
@@ -109,7 +109,7 @@ def test_loop(result, motion_bag):
     assert loop['round_trip_max_ms'] == trips[-1]
 
 
-def test_namespace_and_recorder_time_change_nothing(synthetic, tmp_path, result):
+def test_namespace_and_recorder_time_have_no_effect(synthetic, tmp_path, result):
     messages = synthetic.motion_messages(namespace='/lab')
     for entries in messages.values():
         entries[:] = [(20 * received_ns % 2**62, message) for received_ns, message in entries]
@@ -117,7 +117,7 @@ def test_namespace_and_recorder_time_change_nothing(synthetic, tmp_path, result)
     assert other == result
 
 
-def test_whole_turns_between_topics_change_nothing(motion_with, result):
+def test_whole_turns_between_topics_have_no_effect(motion_with, result):
     def turn(messages):
         for number, name in ((1, '/estimate/link_states'), (-2, '/reference')):
             for _, message in messages[name]:
@@ -134,7 +134,7 @@ def test_late_recorder_does_not_shift_the_start(motion_with, synthetic):
     assert find_manoeuvre(motion_with(delay)).start_ns == synthetic.START_NS
 
 
-def test_refused_setpoint_is_not_the_one_that_was_followed(motion_with, synthetic):
+def test_refused_setpoint_is_not_the_begin_of_the_motion(motion_with, synthetic):
     def refuse(messages):
         received_ns, _ = messages['/setpoint'][0]
         for later, goal in ((1_000_000_000, [1.0, np.nan]), (600_000_000, [-2.0, 1.0])):
@@ -145,7 +145,7 @@ def test_refused_setpoint_is_not_the_one_that_was_followed(motion_with, syntheti
     assert motion.start_ns == synthetic.START_NS
 
 
-def test_goal_of_a_link_without_setpoint_is_what_the_reference_holds(motion_with, synthetic):
+def test_goal_of_a_link_without_setpoint_is_its_reference(motion_with, synthetic):
     def hold(messages):
         received_ns, _ = messages['/setpoint'][0]
         messages['/setpoint'] = [(received_ns, synthetic.joint_state(
@@ -156,7 +156,7 @@ def test_goal_of_a_link_without_setpoint_is_what_the_reference_holds(motion_with
     assert goal[:2] == pytest.approx([synthetic.TURN_RAD, 1.25])
 
 
-def test_setpoint_where_the_linkage_is_already(motion_with, synthetic):
+def test_setpoint_at_the_present_angles(motion_with, synthetic):
     def rest(messages):
         received_ns, _ = messages['/setpoint'][0]
         messages['/setpoint'] = [(received_ns, synthetic.joint_state(
@@ -202,7 +202,7 @@ def test_recording_that_ends_early_has_no_final_error(motion_with, synthetic):
     ('energy', {name for name in METRICS if name.startswith('energy.')}),
     ('controller_status', set()),
 ])
-def test_optional_topic_costs_its_metrics_and_no_other(motion_with, result, topic, lost):
+def test_missing_optional_topic_removes_its_metrics_only(motion_with, result, topic, lost):
     def leave_out(messages):
         del messages[f'/{topic}']
     poorer = compute_metrics(motion_with(leave_out), PAPER)
@@ -212,7 +212,7 @@ def test_optional_topic_costs_its_metrics_and_no_other(motion_with, result, topi
         assert poorer[group][key] == result[group][key]
 
 
-def test_recording_from_before_copper_losses_were_told_lacks_nothing_else(motion_with, result):
+def test_recording_without_copper_losses_has_all_other_metrics(motion_with, result):
     def older(messages):
         for _, message in messages['/energy']:
             del message.name[-1]

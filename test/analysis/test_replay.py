@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A replay says what the estimator would have said, and how far that is from what it did say."""
+"""Replay of the estimator over a bag, and comparison with the recorded estimates."""
 
 from dataclasses import asdict
 import sqlite3
@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin, Writer
 
-# With which the run was made.
+# Settings of the recorded run.
 OWN = asdict(load_scenario('prototype').estimator)
 LINKS = ('link_a', 'link_b', 'link_c', 'link_d')
 ESTIMATES = ('link_states', 'sigma', 'covariance', 'disturbance', 'decisions', 'innovation')
@@ -40,7 +40,7 @@ def numbers(bag, replayed_to, **values):
 
 
 def changed(messages, topic, change):
-    """Return messages with each of one topic changed: change(index, message) may return more."""
+    """Return messages with those of one topic replaced by change(index, message)."""
     entries = []
     for index, (logged, message) in enumerate(messages[topic]):
         entries += [(logged, new) for new in change(index, message)]
@@ -49,7 +49,7 @@ def changed(messages, topic, change):
 
 @pytest.fixture(scope='module')
 def same(loop_bag, tmp_path_factory):
-    """Return a replay with the settings that the run had, and its bag."""
+    """Return a replay with the settings of the run, and its bag."""
     output = tmp_path_factory.mktemp('replay') / 'new'
     return replay(loop_bag, output, OWN), output
 
@@ -68,7 +68,7 @@ def test_same_settings_give_the_same_estimates_bit_for_bit(synthetic, loop_bag, 
     assert compare(same[0]).identical
 
 
-def test_everything_else_is_copied_as_it_is(loop_bag, same):
+def test_other_topics_are_copied_unchanged(loop_bag, same):
     others = {'/device_status', '/link_angles', '/flywheel_states', '/sim/link_states'}
     assert stored(loop_bag, others) == stored(same[1], others)
     assert {topic for topic, *_ in stored(same[1])} <= {
@@ -106,14 +106,14 @@ def test_same_bag_and_settings_give_the_same_bytes(loop_bag, tmp_path):
 @pytest.mark.parametrize('how', [
     {'compression': CompressionMode.MESSAGE, 'version': 8},
     {'compression': CompressionMode.FILE, 'storage': StoragePlugin.SQLITE3}], ids=str)
-def test_storage_makes_no_difference(synthetic, loop_messages, same, tmp_path, how):
+def test_storage_has_no_effect(synthetic, loop_messages, same, tmp_path, how):
     bag = synthetic.write_bag(tmp_path / 'bag', loop_messages, **how)
     replay(bag, tmp_path / 'new', OWN)
     assert stored(tmp_path / 'new') == stored(same[1])
 
 
 @pytest.mark.parametrize('storage', list(StoragePlugin), ids=lambda plugin: plugin.name)
-def test_single_file_is_enough(synthetic, loop_messages, same, tmp_path, storage):
+def test_single_file_suffices(synthetic, loop_messages, same, tmp_path, storage):
     bag = synthetic.write_bag(tmp_path / 'bag', loop_messages, storage)
     file, = [path for path in bag.iterdir() if path.name != 'metadata.yaml']
     replay(file, tmp_path / 'new', OWN)
@@ -169,7 +169,7 @@ def test_messages_of_unknown_types_are_copied_with_their_definitions(
 
 # Suites and settings
 
-def test_one_of_two_suites_is_chosen_by_its_namespace(
+def test_namespace_selects_one_of_two_suites(
         synthetic, loop_messages, same, refuses, tmp_path):
     both = {f'{space}{topic}': entries for space in ('/table1', '/lab/table2')
             for topic, entries in loop_messages.items()}
@@ -201,8 +201,8 @@ def test_mechanism_is_that_of_the_device_unless_it_is_given(loop_bag, same, tmp_
     assert not compare(found).identical
 
 
-def test_settings_act(loop_bag, tmp_path):
-    """With ten times the noise in mind, innovations look a hundred times as probable."""
+def test_settings_have_an_effect(loop_bag, tmp_path):
+    """With ten times the assumed noise, the NIS is a hundred times smaller."""
     found = numbers(loop_bag, tmp_path / 'new', angle_noise=0.017453, counts_per_turn=0)
     assert found['settings']['angle_noise'] == 0.017453
     nis = found['nis_per_degree_of_freedom']
@@ -225,9 +225,9 @@ def test_bad_settings_are_refused(loop_bag, refuses, tmp_path, values, kind, exp
 
 # The comparison
 
-def test_differences_are_what_the_recorded_estimate_was_moved_by(
+def test_differences_are_the_changes_of_the_recorded_estimate(
         synthetic, loop_messages, tmp_path):
-    """By a constant, so rms and largest are that; a whole turn is no difference."""
+    """The change is constant, so it is rms and largest difference; a whole turn is none."""
     angles, rates = np.array([0.01, -0.02, 0.03, 2 * np.pi]), np.array([0.1, 0.2, -0.3, 0.0])
 
     def moved(_, message):
@@ -247,15 +247,15 @@ def test_differences_are_what_the_recorded_estimate_was_moved_by(
             for key in keys:
                 assert found['replayed_minus_recorded'][name][key] == pytest.approx(
                     abs(amount), abs=1e-12)
-        # And the truth tells which of the two was moved.
+        # Comparison with the truth shows which of the two is changed.
         key = 'rate_rms_rad_s'
         assert found['recorded_minus_truth'][name][key] >= 0.9 * abs(rates[link])
         assert found['replayed_minus_truth'][name][key] < 0.05
 
 
-def test_what_comes_before_both_have_settled_does_not_count(
+def test_difference_before_both_estimates_have_settled_does_not_count(
         synthetic, loop_messages, tmp_path):
-    """A recorded estimator that began a second late is not held to what it said then."""
+    """The comparison starts after the start of a recorded estimator that is a second late."""
     late = {topic: entries[100:] if topic.startswith('/estimate/') else entries
             for topic, entries in loop_messages.items()}
     bag = synthetic.write_bag(tmp_path / 'bag', late)
@@ -265,7 +265,7 @@ def test_what_comes_before_both_have_settled_does_not_count(
     assert as_json(comparison)['replayed_minus_recorded']['samples'] == len(stamps) - 125
 
 
-def test_bag_without_estimates_and_truth_has_less_to_tell(synthetic, loop_messages, tmp_path):
+def test_bag_without_estimates_and_truth_has_fewer_comparisons(synthetic, loop_messages, tmp_path):
     bare = {topic: loop_messages[topic] for topic in ('/link_angles', '/flywheel_states')}
     bag = synthetic.write_bag(tmp_path / 'bag', bare)
     comparison = compare(replay(bag, tmp_path / 'new', {**OWN, 'mechanism': 'prototype'}))
@@ -278,7 +278,7 @@ def test_bag_without_estimates_and_truth_has_less_to_tell(synthetic, loop_messag
     assert render(lambda: comparison_figure(comparison), 'png').startswith(b'\x89PNG')
 
 
-def test_messages_of_no_use_are_counted_and_the_run_goes_on(synthetic, loop_messages, tmp_path):
+def test_unusable_messages_are_counted_and_have_no_effect(synthetic, loop_messages, tmp_path):
     def spoilt(index, message):
         bad = {100: ([*LINKS[:3], 'link_x'], [0.0] * 4), 200: (LINKS, [np.nan] * 4),
                300: (LINKS, [0.0])}
@@ -292,11 +292,11 @@ def test_messages_of_no_use_are_counted_and_the_run_goes_on(synthetic, loop_mess
                        '/flywheel_states', backwards)
     found = numbers(synthetic.write_bag(tmp_path / 'bag', messages), tmp_path / 'new')
     assert found['replayed']['rejected'] == {'names': 1, 'finite': 1, 'length': 1, 'stamp': 1}
-    # None of them left a trace.
+    # They have no effect on the estimates.
     assert found['identical']
 
 
-def test_tick_that_was_sent_again_is_answered_again(synthetic, loop_messages, tmp_path):
+def test_repeated_tick_is_answered_again(synthetic, loop_messages, tmp_path):
     messages = changed(loop_messages, '/flywheel_states',
                        lambda index, message: [message] * (2 if index == 300 else 1))
     found = replay(synthetic.write_bag(tmp_path / 'bag', messages), tmp_path / 'new', OWN)
@@ -306,7 +306,7 @@ def test_tick_that_was_sent_again_is_answered_again(synthetic, loop_messages, tm
 
 
 def test_gated_samples_and_faults_are_counted(synthetic, loop_messages, tmp_path):
-    """Link c is 0.1 rad off for half a second; the recorded estimator told of other things."""
+    """Link c has an error of 0.1 rad for half a second; the recorded faults differ."""
     def off(index, message):
         if not 200 <= index < 325 or 'link_c' not in message.name:
             return [message]
@@ -351,7 +351,7 @@ def test_skip_beyond_the_end_is_refused(same, refuses):
         compare(same[0], 100.0)
 
 
-# Bags that will not do
+# Refused bags
 
 @pytest.fixture
 def refused(refuses, tmp_path):
@@ -375,7 +375,7 @@ def test_a_path_without_a_bag_is_refused(refused, tmp_path):
         refused(tmp_path / name, 'damaged')
 
 
-def test_bag_of_a_killed_recorder_comes_with_the_repair(loop_bag, refused, tmp_path):
+def test_error_for_a_bag_of_a_killed_recorder_has_the_repair(loop_bag, refused, tmp_path):
     bag = tmp_path / 'killed'
     bag.mkdir()
     (bag / 'killed.mcap').write_bytes(next(loop_bag.glob('*.mcap')).read_bytes())
@@ -415,7 +415,7 @@ def test_single_file_cut_anywhere_is_refused(loop_bag, refused, tmp_path):
 
 
 def test_bag_that_lost_messages_is_refused(synthetic, loop_messages, refuses, tmp_path):
-    """Its metadata states more messages."""
+    """The metadata of the bag states more messages."""
     bag = synthetic.write_bag(tmp_path / 'bag', loop_messages, StoragePlugin.SQLITE3)
     with sqlite3.connect(bag / 'bag.db3') as base:
         base.execute('DELETE FROM messages WHERE id > 1500')

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page stands alone, is well-formed, keeps peaks, and says what it lacks."""
+"""The report page: self-contained, well-formed, with all peaks and a list of missing data."""
 
 from html.parser import HTMLParser
 import json
@@ -35,7 +35,7 @@ def figures(page):
         r'<section id="(\w+)"><h2>[^<]*</h2><figure>(<svg.*?</svg>)', page, re.DOTALL)}
 
 
-def test_page_and_json_hold_the_same_numbers(written):
+def test_page_and_json_have_the_same_numbers(written):
     result, page, text = written
     assert json.loads(text) == result
     for group in ('tracking', 'estimate', 'flywheel', 'energy', 'loop'):
@@ -48,7 +48,7 @@ def test_every_figure_is_drawn_and_well_formed(written):
     assert list(figures(written[1])) == NAMES
 
 
-def test_page_stands_alone(written):
+def test_page_is_self_contained(written):
     page = written[1]
     outside = re.sub(r'xmlns(:\w+)?="[^"]*"', '', page)
     assert not re.search(r'https?:|<link|<script|@import|url\((?!#)|src=', outside)
@@ -84,8 +84,8 @@ def contrast(one, other):
 
 @pytest.mark.parametrize('paper', [0, 1], ids=['light', 'dark'])
 @pytest.mark.parametrize('name', ['ink', 'muted', 'limit', 'link_a', 'link_b', 'link_c', 'link_d'])
-def test_text_and_curves_can_be_read(name, paper):
-    # 4.5 is what WCAG AA asks of text; the link colours are used for text too.
+def test_text_and_curves_have_contrast(name, paper):
+    # WCAG AA requires 4.5 for text; the link colours are used for text too.
     assert contrast(style.PALETTE[name][paper], style.PALETTE['paper'][paper]) >= 4.0
 
 

@@ -43,7 +43,7 @@ def lab() -> Table:
 
 @pytest.fixture(scope='session')
 def irregular(prototype: Mechanism) -> Mechanism:
-    """Make a bench-scale linkage with nothing equal to anything else."""
+    """Make a bench-scale linkage without equal parameters."""
     return replace(  # type: ignore[arg-type]
         prototype, link_lengths=[0.36, 0.24, 0.33, 0.30], link_masses=[0.6, 0.7, 0.65, 0.55],
         link_inertias=[6e-3, 5e-3, 7e-3, 5.5e-3],
@@ -52,9 +52,9 @@ def irregular(prototype: Mechanism) -> Mechanism:
 
 class Bed:
     """
-    A simulated table that is driven tick by tick, and what it said.
+    A simulated table that is driven tick by tick, with its recorded samples.
 
-    :ivar efforts: torques of every tick, as asked for [N m].
+    :ivar efforts: commanded torques of every tick [N m].
     """
 
     def __init__(self, mechanism: Mechanism, table: Table, seed: int,
@@ -69,7 +69,7 @@ class Bed:
         self.efforts: list[dict[str, float]] = []
 
     def tick(self) -> None:
-        """Go on to the next tick."""
+        """Advance to the next tick."""
         samples = self._device.step(self._stamp_ns, self._drive)
         for reading in samples.links:
             row = np.full(4, np.nan)
@@ -94,7 +94,7 @@ class Bed:
             self.tick()
 
     def recorded(self) -> tuple[LinkMeasurements, WheelMeasurements]:
-        """Return what a bag would hold."""
+        """Return the measurements as from a bag."""
         stamps, angles = zip(*self._links)
         ticks, wheels = zip(*self._wheels)
         return (link_measurements(np.array(stamps), np.array(angles), BEGIN_NS),
@@ -116,5 +116,5 @@ def excited() -> Excited:
 
 @pytest.fixture(scope='session')
 def make_bed() -> type[Bed]:
-    """Give the bed itself."""
+    """Return the class of beds."""
     return Bed

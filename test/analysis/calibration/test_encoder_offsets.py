@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Zeros of the link encoders: found within their intervals, refused where links do not rest."""
+"""Encoder offsets: estimates, intervals, poses, and refusal of moving links."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -37,16 +37,16 @@ def readings(pose: Any, seed: int, drift: float = 0.0, noise: float = NOISE) -> 
 
 
 @pytest.mark.parametrize('phi_a', [0.0, 3.13, -3.13])
-def test_offsets_are_found_wherever_the_circle_is_cut(prototype: Mechanism, phi_a: float) -> None:
+def test_offsets_are_found_at_any_orientation(prototype: Mechanism, phi_a: float) -> None:
     pose = assemble(prototype, phi_a, phi_a + 1.0)
     found = encoder_offsets(readings(pose, seed=3), pose)
-    # Five standard errors: once in two million.
+    # Errors exceed five standard errors once in two million.
     np.testing.assert_array_less(np.abs(found.offsets - BIASES), 5.0 * found.standard_errors)
     np.testing.assert_allclose(found.standard_errors, NOISE / np.sqrt(COUNT), rtol=0.5)
 
 
-def test_intervals_cover_the_truth_as_often_as_they_say(prototype: Mechanism) -> None:
-    """Of 200 intervals at 95 % fewer than the bound cover it once in ten thousand."""
+def test_intervals_have_their_coverage(prototype: Mechanism) -> None:
+    """The bounds of the count of 200 intervals at 95 % have a probability of 1e-4 each."""
     pose = assemble(prototype, 0.2, 1.2)
     covered = 0
     for seed in range(50):
@@ -58,7 +58,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say(prototype: Mechanism) ->
 
 def test_bias_of_the_simulated_sensors_is_found(
         prototype: Mechanism, lab: Table, make_bed: Callable[..., Any]) -> None:
-    """The table of the prototype, whose friction keeps its links at rest; seed 1."""
+    """Friction of the table of the prototype keeps its links at rest; seed 1."""
     biased = replace(lab, link_sensors=replace(lab.link_sensors, bias=tuple(BIASES)))
     bed = make_bed(prototype, biased, 1, InitialState())
     for _ in range(COUNT):
@@ -66,7 +66,7 @@ def test_bias_of_the_simulated_sensors_is_found(
     links, _ = bed.recorded()
     pose = jig_pose(prototype, {'link_a': 0.0, 'link_b': np.pi / 3}, mean_readings(links))
     found = encoder_offsets(links, pose)
-    # Sensor noise, and the quantization of 14 bits, which the noise dithers.
+    # The noise dithers the quantization of 14 bits.
     np.testing.assert_allclose(found.offsets, BIASES, atol=5.0 * NOISE / np.sqrt(0.98 * COUNT))
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Excitations end by themselves, keep the limits, and stop where it would go too far."""
+"""Excitations: end, limits, and stop near a change point or at a too fast wheel."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,7 +22,7 @@ import pytest
 
 def test_one_wheel_after_the_other_and_all_come_to_rest(
         prototype: Mechanism, lab: Table, make_bed: Callable[..., Any]) -> None:
-    """Seed 0; while a wheel has its turn no other is driven."""
+    """Only one wheel is driven at a time; seed 0."""
     bed = make_bed(prototype, lab, 0, InitialState())
     bed.follow(SpinAndCoast(prototype, [2, 0], 60.0, 0.02, 2.0))
     for efforts in bed.efforts:
@@ -32,7 +32,7 @@ def test_one_wheel_after_the_other_and_all_come_to_rest(
     _, wheels = bed.recorded()
     assert np.abs(wheels.speeds[:, [2, 0]]).max() == pytest.approx(60.0, abs=2.0)
     assert (wheels.speeds.min(axis=0)[[0, 2]] < -55.0).all()
-    # Rest is where braking ends, and what the motor's lag still adds within a few ticks.
+    # After braking the motor lag adds some speed within a few ticks.
     assert np.abs(wheels.speeds[-1]).max() < 6.0
 
 
@@ -59,7 +59,7 @@ def test_first_direction_leads_away_from_change_points(
 
 def test_multi_sine_keeps_the_limit_and_does_not_drift(
         prototype: Mechanism, lab: Table, make_bed: Callable[..., Any]) -> None:
-    """Links swing about where they were; seed 0."""
+    """Links oscillate about their initial angles; seed 0."""
     bed = make_bed(prototype, lab, 0, InitialState())
     bed.follow(MultiSine(prototype, 20.0, 0.02))
     asked = np.array([[efforts[name] for name in FLYWHEEL_NAMES] for efforts in bed.efforts])
@@ -69,11 +69,11 @@ def test_multi_sine_keeps_the_limit_and_does_not_drift(
     swing = np.nanmax(links.angles, axis=0) - np.nanmin(links.angles, axis=0)
     final = np.nanmean(links.angles[-50:], axis=0) - np.nanmean(links.angles[:50], axis=0)
     assert (swing > 0.1).all()
-    # Friction of the bearings takes a share of the momentum, no more than it is of the torque.
+    # The share of momentum lost to bearing friction is at most its share of the torque.
     assert (np.abs(final) < swing).all()
 
 
-def test_change_point_ahead_stops_it(
+def test_excitation_stops_before_a_change_point(
         prototype: Mechanism, refuses: Callable[..., Any]) -> None:
     excitation = MultiSine(prototype, 20.0, 0.02)
     excitation.efforts(0.0, assemble(prototype, 0.0, 1.0), np.zeros(4))
@@ -89,7 +89,7 @@ def test_links_in_a_jig_may_be_anywhere(prototype: Mechanism) -> None:
         assert excitation.efforts(elapsed_s, near, np.zeros(4)) is not None
 
 
-def test_wheel_that_runs_too_fast_stops_it(
+def test_excitation_stops_at_a_too_fast_wheel(
         prototype: Mechanism, refuses: Callable[..., Any]) -> None:
     excitation = MultiSine(prototype, 20.0, 0.02)
     with refuses(CalibrationError, reason='speed', name='flywheel_c', value=280.0, limit=270.0):

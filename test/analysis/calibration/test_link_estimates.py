@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Links: what a motion depends on is found to 1 % and within its intervals, the rest stays."""
+"""Link parameters: determined combinations are found to 1 %, the others keep their prior."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -56,7 +56,7 @@ def estimates(prototype: Mechanism, irregular: Mechanism, lab: Table, excited: C
 @pytest.mark.parametrize('name', START)
 def test_reduced_inertias_are_found_to_one_percent(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]], name: str) -> None:
-    """Of the size of the diagonal; the file beforehand is farther off."""
+    """The error is below 1 % of the diagonal, and below 30 % of that of the prior."""
     for seed, (truth, found) in enumerate(estimates[name]):
         wanted = reduced(truth, found.poses)
         size = np.sqrt(wanted[0] * wanted[2])
@@ -73,7 +73,7 @@ def test_only_noise_is_left_where_nothing_else_moved_the_links(
 
 def test_disturbance_in_the_residuals_is_reported(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]]) -> None:
-    """A degree to and fro, as a push by the edge of the table leaves it."""
+    """The disturbance is an oscillation of a degree, as after a contact with the edge."""
     _, found = estimates['prototype'][0]
     without = links_text(found, [], []).splitlines()
     pushed = replace(found, residuals=tuple(
@@ -90,7 +90,7 @@ def test_intervals_cover_the_truth(
     """
     A_aa, A_ab and A_bb at a middle pose: of 12 intervals at 95 %, seeds 0 to 3.
 
-    Fewer than the bound cover the truth once in a thousand, were they independent.
+    The bound of the count has a probability of 1e-3 for independent intervals.
     """
     covered = 0
     for truth, found in estimates[name]:
@@ -100,12 +100,12 @@ def test_intervals_cover_the_truth(
     assert covered >= binom.ppf(1e-3, 3 * len(SEEDS), 0.95), 'seeds 0-3'
 
 
-def test_rhombus_tells_four_combinations_and_another_linkage_more(
+def test_rhombus_determines_four_combinations_and_another_linkage_more(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]]) -> None:
     """
-    A rhombus has A_aa, A_bb, and A_ab with a cosine and a sine: no motion tells more.
+    A motion of a rhombus depends on A_aa, A_bb, and A_ab with a cosine and a sine.
 
-    The order of magnitude between the fourth and the fifth says that this is no matter of noise.
+    The fourth and the fifth combination differ by an order of magnitude, far more than noise.
     """
     for seed, (_, found) in enumerate(estimates['prototype']):
         assert [one.determined for one in found.combinations] == [True] * 4 + [False] * 8, seed
@@ -114,12 +114,12 @@ def test_rhombus_tells_four_combinations_and_another_linkage_more(
         assert sum(one.determined for one in found.combinations) > 4, seed
 
 
-def test_sums_over_opposite_links_are_told_and_differences_are_not(
+def test_sums_over_opposite_links_are_determined_and_differences_are_not(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]]) -> None:
     """
-    In a rhombus I_a - I_c has no effect; what has none does not move.
+    In a rhombus I_a - I_c has no effect, so its estimate is the prior.
 
-    Of all files that fit as well the nearest is taken, so the truth is farther away.
+    The estimate is the nearest one to the prior of all equal fits, so the truth is farther.
     """
     for seed, (truth, found) in enumerate(estimates['prototype']):
         weights = np.array([one.weights for one in found.combinations if one.determined])
@@ -128,7 +128,7 @@ def test_sums_over_opposite_links_are_told_and_differences_are_not(
         for first, second in ((0, 2), (1, 3)):
             apart = np.zeros(12)
             apart[[first, second]] = np.array([1.0, -1.0]) / np.sqrt(2.0)
-            # Sizes are shares of what is believed of each, and that differs by 5 %.
+            # Components are relative to the prior, which differs by 5 %.
             assert np.linalg.norm(weights @ apart) < 0.1, f'seed {seed}'
             assert abs(moved @ apart) < 0.1 * np.linalg.norm(moved), f'seed {seed}'
         assert np.linalg.norm(moved) < np.linalg.norm(away), f'seed {seed}'
@@ -136,7 +136,7 @@ def test_sums_over_opposite_links_are_told_and_differences_are_not(
 
 def test_noise_of_the_sensors_is_what_is_left(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]], lab: Table) -> None:
-    """Noise and the rounding to 14 bits; 20000 samples know it to half a percent."""
+    """Residuals are noise and rounding to 14 bits; their rms is known to half a percent."""
     expected = np.hypot(lab.link_sensors.noise_rms,
                         2.0 * np.pi / lab.link_sensors.counts_per_turn / np.sqrt(12.0))
     for pairs in estimates.values():

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Wheels: found to 1 % and within their intervals, whatever the links do."""
+"""Wheel parameters: estimates to 1 % and intervals, with free links."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,9 +29,9 @@ TOP, TORQUE, COAST = 80.0, 0.02, 6.0
 def test_truth_is_found_to_one_percent_and_covered(
         prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
     """
-    On the table of the prototype, links free: seeds 0 to 9, each wheel five times.
+    Wheels on the table of the prototype with free links, seeds 0 to 9.
 
-    Of 30 intervals at 95 % fewer than the bound cover the truth once in a thousand.
+    The bound of the count of 30 intervals at 95 % has a probability of 1e-3.
     """
     uneven = replace(prototype, flywheel_inertias=np.array([1.2e-4, 1.3e-4, 1.1e-4, 1.25e-4]))
     covered = 0
@@ -50,7 +50,7 @@ def test_truth_is_found_to_one_percent_and_covered(
 
 def test_all_wheels_one_after_the_other(
         prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
-    """Seed 7; the friction for the controller is the mean."""
+    """The friction for the controller is the mean; seed 7."""
     links, wheels = excited(
         prototype, lab, SpinAndCoast(prototype, range(4), TOP, TORQUE, COAST), 7)
     assert driven_wheels(wheels) == [0, 1, 2, 3]
@@ -64,7 +64,7 @@ def test_all_wheels_one_after_the_other(
 
 def test_recoil_of_the_links_is_accounted_for(
         prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
-    """Without it the inertia would be off by that of the wheel over that of a pair, 0.3 %."""
+    """The recoil changes the inertia by that of the wheel over that of a pair, 0.3 %."""
     links, wheels = excited(
         prototype, lab, SpinAndCoast(prototype, [0], TOP, TORQUE, COAST), 0)
     held = replace(links, angles=np.zeros_like(links.angles))
@@ -73,20 +73,20 @@ def test_recoil_of_the_links_is_accounted_for(
     assert wrong / right - 1.0 == pytest.approx(-1.2e-4 / 0.039, rel=0.3)
 
 
-def test_model_that_misses_something_widens_the_intervals(
+def test_unmodelled_error_widens_the_intervals(
         prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
-    """A wobble of the readings that lasts for many samples is no white noise; seed 2."""
+    """The readings have an oscillation over many samples, which is no white noise; seed 2."""
     links, wheels = excited(
         prototype, lab, SpinAndCoast(prototype, [0], TOP, TORQUE, COAST), 2)
     wobbling = replace(
         links, angles=links.angles + 5e-3 * np.sin(8.0 * links.times)[:, None])
     honest, doubtful = (wheel_estimate(0, signal, wheels) for signal in (links, wobbling))
-    # The rms of the residuals grows by two; what stays for a quarter of a second by far more.
+    # The rms of the residuals doubles, and the autocorrelation grows by far more.
     assert doubtful.covariance[0, 0] > 20.0 * honest.covariance[0, 0]
 
 
 def cut(wheels: WheelMeasurements, keep: Any) -> WheelMeasurements:
-    """Return the ticks that an index picks."""
+    """Return the ticks of an index."""
     return WheelMeasurements(wheels.times[keep], wheels.angles[keep], wheels.speeds[keep],
                              wheels.efforts[keep])
 
