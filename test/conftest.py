@@ -27,10 +27,10 @@ Array = NDArray[np.float64]
 settings.register_profile('patient', deadline=None)
 settings.load_profile('patient')
 
-# Passed tests per dot of a run with workers: ten thousand dots hide what matters.
+# Passed tests per dot of a run with workers; one dot a test would hide failures.
 PASSED_PER_DOT = 100
 _passed = count(1)
-# Niceness of computing tests: a tenth of a processor that a node wants as well.
+# Niceness of computing tests, which leaves nine tenths of a shared processor to nodes.
 NICE = 10
 
 
@@ -50,12 +50,12 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 @cache
 def has_processes(file: str) -> bool:
-    """Tell whether a file marks tests that start processes."""
+    """Return whether a file marks tests that start processes."""
     return re.search(r'mark\.(node|package)\b', Path(file).read_text()) is not None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the tests that start processes first: the other worker computes meanwhile."""
+    """Run the tests that start processes first, beside the computing tests of the other worker."""
     items.sort(key=lambda item: has_processes(str(item.path)), reverse=True)
 
 
@@ -81,7 +81,7 @@ def paper() -> Mechanism:
 
 @pytest.fixture(scope='session')
 def uneven() -> Mechanism:
-    """Make a linkage with nothing equal to anything else."""
+    """Make a linkage without equal parameters."""
     return Mechanism(  # type: ignore[arg-type]
         [0.12, 0.08, 0.11, 0.10], [0.02, 0.03, 0.025, 0.018], [2.2e-5, 1.5e-5, 3e-5, 1.8e-5],
         [[0.05, 0.01], [0.04, -0.01], [0.06, 0.005], [0.05, 0.0]], [3e-7, 4e-7, 5e-7, 2e-7],
@@ -120,14 +120,14 @@ def _refused(kind: type[FourbarError], /, **values: Any
         yield caught
     found = {name: caught.value.values.get(name) for name in values}
     assert found == values, caught.value
-    # One line, as commands print it and nodes log it.
+    # Commands print the error in one line, and nodes log it in one line.
     assert len(str(caught.value).splitlines()) == 1
 
 
 @pytest.fixture(scope='session')
 def refuses() -> Callable[..., AbstractContextManager[pytest.ExceptionInfo[FourbarError]]]:
     """
-    Return a context that expects an error of a type, with these of its values.
+    Return a context that expects an error of a type with given values.
 
     `with refuses(TableError, name='joints.viscous', value=-1.0): ...`; wording is not compared.
     """

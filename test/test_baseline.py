@@ -78,14 +78,14 @@ def differences(before: Any, after: Any, place: str = '') -> list[str]:
 
 
 def without_times(document: dict[str, Any]) -> dict[str, Any]:
-    """Leave out wall times and residuals of rounding, which no two machines share."""
+    """Remove wall times and rounding residuals, which depend on the machine."""
     return {**{key: value for key, value in document.items() if key != 'grid_seconds'},
             'checks': [check for check in document['checks']
                        if check['unit'] != 's' and not is_residual(check)]}
 
 
 def is_residual(check: dict[str, Any]) -> bool:
-    """Tell whether a check bounds a rounding error."""
+    """Return whether a check bounds a rounding error."""
     limit = check['limit']
     return not isinstance(limit, list) and 0.0 < limit <= 1e-6
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Documents that are made from the code, or that people type from, say what is true."""
+"""Documents agree with the code: generated tables, commands, limits and links."""
 
 from collections.abc import Mapping
 from dataclasses import fields, MISSING
@@ -42,7 +42,7 @@ def test_parameters_file_of_the_prototype_is_that_of_its_scenario() -> None:
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page: Path) -> None:
+def test_relative_links_exist(page: Path) -> None:
     """Follow every relative link and picture."""
     targets = re.findall(r'\]\(([^)#\s]+)\)', page.read_text())
     missing = [target for target in targets
@@ -64,7 +64,7 @@ Rows = dict[str, list[str]]
 
 
 def table_under(heading: str) -> Rows:
-    """Return the first table below a heading of table.md: other cells by that of the key."""
+    """Return the first table below a heading of table.md as cells by key."""
     text = (ROOT / 'docs' / 'table.md').read_text()
     below = text.split(f'\n{heading}\n', 1)[1]
     block = re.search(r'(?:^\|.*\|\n)+', below, re.MULTILINE)
@@ -83,22 +83,22 @@ def number(cell: str) -> Any:
 
 
 @pytest.mark.parametrize('section', list(SECTIONS))
-def test_keys_of_a_table_file_are_told(section: str) -> None:
-    """All of them and no other, with defaults and the values of the presets."""
-    told = table_under(f'### `{section}`')
+def test_keys_of_a_table_file_are_documented(section: str) -> None:
+    """The page has exactly the keys, with defaults and the values of the presets."""
+    documented = table_under(f'### `{section}`')
     keys = {item.name: item.default for item in fields(SECTIONS[section])}
-    assert list(told) == list(keys)
+    assert list(documented) == list(keys)
     presets = [load_yaml(config_file('table', name))[section] if section in load_yaml(
         config_file('table', name)) else {} for name in ('ideal', 'prototype')]
     for key, default in keys.items():
         values = ['' if value is MISSING else str(value).lower() if isinstance(value, bool)
                   else value for value in (default, *(preset.get(key, '') for preset in presets))]
-        assert [number(cell) for cell in told[key][2:5]] == values, key
+        assert [number(cell) for cell in documented[key][2:5]] == values, key
 
 
 @pytest.mark.parametrize('section', list(SECTIONS))
-def test_allowed_values_of_a_table_file_are_told(section: str) -> None:
-    """The ends of each range are taken, and what lies just beyond is refused by name."""
+def test_allowed_values_of_a_table_file_are_documented(section: str) -> None:
+    """The ends of each range are accepted, and values beyond them are refused by name."""
     made = SECTIONS[section]
     given = {item.name: 0 for item in fields(made) if item.default is MISSING}
     for key, (_, allowed, *_) in table_under(f'### `{section}`').items():
@@ -118,8 +118,8 @@ def test_allowed_values_of_a_table_file_are_told(section: str) -> None:
 
 @pytest.mark.parametrize(('heading', 'kinds'), [
     ('### Of a link sensor', SENSOR_FAULTS), ('### Of a flywheel drive', WHEEL_FAULTS)])
-def test_faults_are_told(heading: str, kinds: Mapping[str, FaultKind]) -> None:
-    """Every kind and no other, as the plant knows them."""
+def test_faults_are_documented(heading: str, kinds: Mapping[str, FaultKind]) -> None:
+    """The page has exactly the kinds of the plant."""
     assert table_under(heading) == {
         name: [kind.meaning, kind.quantity, kind.unit,
                *(['', ''] if kind.default is None
@@ -127,7 +127,7 @@ def test_faults_are_told(heading: str, kinds: Mapping[str, FaultKind]) -> None:
         for name, kind in kinds.items()}
 
 
-def test_schedule_of_the_page_is_one(tmp_path: Path) -> None:
+def test_schedule_of_the_page_is_valid(tmp_path: Path) -> None:
     block = re.search(r'```yaml\n(faults:.*?)```', (ROOT / 'docs' / 'table.md').read_text(),
                       re.DOTALL)
     assert block is not None
@@ -137,18 +137,18 @@ def test_schedule_of_the_page_is_one(tmp_path: Path) -> None:
     assert len(parse_schedule(read_schedule(str(path)), targets, str(path))) == 2
 
 
-def test_entries_of_the_accounts_are_told() -> None:
+def test_entries_of_the_energy_budget_are_documented() -> None:
     assert list(table_under('## Energy budget')) == [item.name for item in fields(EnergyBudget)]
 
 
 @pytest.mark.parametrize('heading', ['## Motors', '## Mechanisms'])
-def test_mechanisms_are_told(heading: str) -> None:
-    """Every value of the presets; their four links are alike."""
+def test_mechanisms_are_documented(heading: str) -> None:
+    """The page has every value of the presets; their four links are equal."""
     presets = [load_yaml(config_file('mechanism', name)) for name in ('paper', 'prototype')]
     defaults = {item.name: item.default[0] for item in fields(Mechanism)
                 if item.default is not MISSING}
-    told = table_under(heading)
-    for key, cells in told.items():
+    documented = table_under(heading)
+    for key, cells in documented.items():
         if key == 'motor_*':
             continue
         for preset, cell in zip(presets, cells[-3:-1] if heading == '## Motors' else cells[1:]):
@@ -157,24 +157,24 @@ def test_mechanisms_are_told(heading: str) -> None:
             expected = values[0] if isinstance(values[0], list) else [values[0]]
             assert [number(part) for part in cell.split(',')] == expected, key
     motors = {item.name for item in fields(Mechanism) if item.name.startswith('motor_')}
-    assert set(told) == (motors if heading == '## Motors' else {
+    assert set(documented) == (motors if heading == '## Motors' else {
         item.name for item in fields(Mechanism)} - motors | {'motor_*'})
 
 
-def test_what_stops_the_prototype_is_told() -> None:
-    """Every row of the table in config, with limit, time, reaction and the least reaction."""
+def test_safety_rules_of_the_prototype_are_documented() -> None:
+    """The page has every row of the table, with limit, time, reaction and least reaction."""
     text = (ROOT / 'docs' / 'hardware.md').read_text().split('## What stops what\n', 1)[1]
-    told = {}
+    documented = {}
     for line in re.findall(r'^\| `.*\|$', text.split('\n## ', 1)[0], re.MULTILINE):
         row, _, limit, lasting, reaction, least = (
             cell.strip() for cell in line.strip('|').split('|'))
-        told[row.strip('`')] = (
+        documented[row.strip('`')] = (
             *(float(re.findall('[0-9.]+', cell)[0]) if cell else 0.0 for cell in (limit, lasting)),
             re.split('[: ]', reaction)[0], least)
     table = load_safety('prototype')
     expected = {row: (rule.limit, rule.lasting, rule.reaction,
                       CONDITIONS[row].least.name.lower()) for row, rule in table.items()}
-    # What only keeps it from being armed has no other consequence.
+    # This rule only prevents arming and has no reaction.
     limit, lasting, *_ = expected['wheel_speed_to_arm']
     expected['wheel_speed_to_arm'] = (limit, lasting, 'refuses', 'refuses')
-    assert told == expected
+    assert documented == expected

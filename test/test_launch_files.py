@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Launch files, as far as they can be checked where there may be no launch."""
+"""Launch files: syntax, arguments and nodes, also without an installed launch package."""
 
 import ast
 from importlib.util import module_from_spec, spec_from_file_location
@@ -24,7 +24,7 @@ def tree_of(path):
 
 
 def calls(path, name):
-    """Return the calls of a name: their first positional argument and their keywords."""
+    """Return first positional argument and keywords of the calls of a name."""
     found = []
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Call) and getattr(node.func, 'id', None) == name:
@@ -34,7 +34,7 @@ def calls(path, name):
 
 
 def constants(path):
-    """Return the module's constants, which may be made of one another."""
+    """Return the constants of the module, which may depend on each other."""
     values = {'str': str, 'float': float, 'int': int, 'bool': bool}
     for node in tree_of(path).body:
         if isinstance(node, ast.Assign):
@@ -49,12 +49,12 @@ def arguments(path):
             for name, given in calls(path, 'DeclareLaunchArgument')}
 
 
-def test_there_is_one_for_the_simulation_and_one_for_the_prototype():
+def test_simulation_and_prototype_have_a_launch_file():
     assert FILES == [PROTOTYPE, SIMULATION]
 
 
 @each_file
-def test_it_compiles_and_describes(path):
+def test_launch_file_compiles_and_has_a_description(path):
     compile(path.read_text(), str(path), 'exec')
     names = [node.name for node in tree_of(path).body if isinstance(node, ast.FunctionDef)]
     assert 'generate_launch_description' in names
@@ -82,7 +82,7 @@ def test_every_argument_is_described(path):
 
 @each_file
 def test_arguments_that_set_parameters_fit_the_tables(path):
-    """Each named node has such a parameter, of the type that it is turned into."""
+    """Each named node has the parameter, of the type of the conversion."""
     for name, (nodes, kind) in constants(path)['PARAMETERS'].items():
         assert name in arguments(path)
         for node in nodes:
@@ -91,7 +91,7 @@ def test_arguments_that_set_parameters_fit_the_tables(path):
 
 
 @each_file
-def test_launch_takes_it(path):
+def test_launch_loads_the_file(path):
     pytest.importorskip('launch_ros')
     from launch.actions import DeclareLaunchArgument
     from launch.launch_description_sources import get_launch_description_from_python_launch_file
@@ -102,7 +102,7 @@ def test_launch_takes_it(path):
 
 
 class Stub(ModuleType):
-    """A module in which every name calls for nothing more than to be remembered."""
+    """A module in which every name is a function that records its calls."""
 
     def __getattr__(self, name):
         if name.startswith('__'):
@@ -111,7 +111,7 @@ class Stub(ModuleType):
 
 
 def actions(monkeypatch, path, given):
-    """Return what a launch file starts with some arguments, as remembered calls."""
+    """Return the recorded calls of a launch file with some arguments."""
     for name in ('launch', 'launch.actions', 'launch.event_handlers', 'launch.substitutions',
                  'launch_ros', 'launch_ros.actions'):
         monkeypatch.setitem(sys.modules, name, Stub(name))
@@ -127,7 +127,7 @@ def actions(monkeypatch, path, given):
 
 
 def nodes_started(monkeypatch, path, given):
-    """Return the parameters of each node that a launch file starts, beside those in files."""
+    """Return the parameters of each started node, without those in files."""
     return {node.executable: dict(pair for part in node.parameters if isinstance(part, dict)
                                   for pair in part.items())
             for node in actions(monkeypatch, path, given)}
@@ -149,20 +149,20 @@ def test_one_argument_sets_the_time_of_all_nodes(monkeypatch, clock, simulated):
 
 
 @each_file
-def test_what_is_not_given_is_left_to_the_parameters_files(monkeypatch, path):
+def test_missing_arguments_set_no_parameter(monkeypatch, path):
     started = nodes_started(monkeypatch, path, {})
     assert len(started) == 3
     assert all(given == {} for given in started.values())
 
 
-def test_prototype_has_its_parameters_file_and_then_that_of_the_user(monkeypatch):
+def test_parameters_file_of_the_user_follows_that_of_the_prototype(monkeypatch):
     for node in actions(monkeypatch, PROTOTYPE, {'params_file': 'lab.yaml', 'rate': '200'}):
         own, users, *_ = node.parameters
         assert Path(own) == ROOT / 'config' / 'nodes_prototype.yaml'
         assert users == 'lab.yaml'
 
 
-def test_arguments_of_the_bus_go_to_the_hardware_node_alone(monkeypatch):
+def test_arguments_of_the_bus_set_parameters_of_the_hardware_node_only(monkeypatch):
     bus = {'bus.interface': 'slcan', 'bus.channel': '/dev/ttyACM0', 'bus.options': 'a=1 b=2'}
     assert nodes_started(monkeypatch, PROTOTYPE, bus) == {
         'hardware': bus, 'estimator': {}, 'controller': {}}

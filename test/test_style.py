@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the tree promises about itself: headers, one-way imports, thin nodes, one version."""
+"""Rules of the source tree: headers, one-way imports, imports of ROS, one version."""
 
 import ast
 from graphlib import CycleError, TopologicalSorter
@@ -26,7 +26,7 @@ SOURCES = [ROOT / 'setup.py', ROOT / 'scripts' / '_run', *(
     path for folder in FOLDERS for path in sorted((ROOT / folder).rglob('*.py')))]
 HEADER = ['# Copyright 2026 The fourbar_ros authors', '# SPDX-License-Identifier: Apache-2.0']
 
-# What each room may import besides itself, from the bottom up.
+# Rooms that each room may import besides itself, from the bottom up.
 _MECHANICS = ('common', 'kernels', 'mechanism')
 _CORE = (*_MECHANICS, 'plant', 'estimation', 'control', 'device')
 _OFFLINE = (*_CORE, 'hardware', 'loop', 'plotting')
@@ -63,7 +63,7 @@ def room_of(path):
 
 
 def imports(path):
-    """Return the full names of all that a file imports, inside functions too."""
+    """Return the full names of all imports of a file, inside functions too."""
     package = '.'.join(path.relative_to(ROOT).parent.parts)
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
@@ -81,7 +81,7 @@ def ros_packages(path):
 
 
 def dependencies():
-    """Return the names that package.xml depends on for running."""
+    """Return the run-time dependencies of package.xml."""
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     return {element.text for element in manifest.findall('exec_depend')}
 
@@ -103,7 +103,7 @@ def test_rooms_import_one_way(path):
 
 
 def test_imports_have_no_cycles():
-    """File by file, imports inside functions and for type checking included."""
+    """The graph of files includes imports inside functions and for type checking."""
     names = {path: '.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__')
              for path in MODULES}
     modules = set(names.values())
@@ -121,7 +121,7 @@ def test_every_folder_is_a_known_room():
 
 
 @each_module
-def test_only_ros_rooms_know_ros(path):
+def test_only_ros_rooms_import_ros(path):
     if room_of(path) not in ('ros', 'operator'):
         assert ros_packages(path) == set()
 
@@ -132,8 +132,8 @@ def test_ros_packages_are_declared(path):
 
 
 @each_module
-def test_machine_code_is_made_in_one_place_and_from_hashed_sources(path):
-    """The cache of the kernels is right only while its fingerprint covers them all."""
+def test_kernels_are_compiled_in_one_place_and_from_hashed_sources(path):
+    """The cache of the kernels is valid only if its fingerprint covers all sources."""
     if path != PACKAGE / 'kernels' / 'compiler.py':
         assert 'numba' not in {name.split('.')[0] for name in imports(path)}
     if 'fourbar_ros.kernels.compiler.kernel' in imports(path):

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A check passes on its limit, fails beyond it, and goes into strictly valid JSON."""
+"""A check passes at its limit, fails beyond it, and is written as valid JSON."""
 
 import json
 from math import inf, nan
@@ -35,7 +35,7 @@ def test_limit_itself_passes(check: Check, passed: bool) -> None:
 
 
 @pytest.mark.parametrize('value', [nan, inf, -inf])
-def test_what_is_not_finite_never_passes_and_is_null(value: float) -> None:
+def test_value_that_is_not_finite_fails_and_is_null(value: float) -> None:
     checks = [at_most('x', value, 's', 1.0), at_least('x', value, 's', 1.0),
               within('x', value, 's', -1.0, 1.0)]
     assert not any(check.passed for check in checks)
@@ -43,14 +43,14 @@ def test_what_is_not_finite_never_passes_and_is_null(value: float) -> None:
 
 
 @pytest.mark.parametrize('limit', [nan, inf])
-def test_limit_that_is_none_is_refused(limit: float) -> None:
+def test_invalid_limit_is_refused(limit: float) -> None:
     with pytest.raises(ValueError, match='gap'):
         at_most('gap', 1.0, 'm', limit)
     with pytest.raises(ValueError, match='gap'):
         within('gap', 1.0, 'm', 0.0, limit)
 
 
-def test_json_is_strict_and_holds_all() -> None:
+def test_json_is_strict_and_complete() -> None:
     checks = [at_most('a', np.float64(0.5), 'rad', np.int64(1)), within('b', 3, 'm', 1, 2),
               at_least('c', nan, '', 0.0)]
     text = json.dumps(checks_as_json(checks), allow_nan=False)
@@ -60,20 +60,20 @@ def test_json_is_strict_and_holds_all() -> None:
         {'name': 'c', 'value': None, 'unit': '', 'limit': 0.0, 'passed': False}]
 
 
-def test_table_is_aligned_and_says_which_missed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_is_aligned_and_names_failed_checks(capsys: pytest.CaptureFixture[str]) -> None:
     print_checks([at_most('closure', 3e-12, 'm', 1e-11),
                   at_least('steps_per_s', 3.5e6, '1/s', 4e6),
                   within('ratio', nan, '', 1.0, 2.0)])
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[-1] for line in lines] == ['ok', 'MISSED', 'MISSED']
-    ends = [line.rindex(verdict) for line, verdict in zip(lines, ('ok', 'MISSED', 'MISSED'))]
+    ends = [line.rindex(result) for line, result in zip(lines, ('ok', 'MISSED', 'MISSED'))]
     assert len(set(ends)) == 1
     assert '<= 1e-11' in lines[0]
     assert '>= 4e+06' in lines[1]
     assert 'in [1, 2]' in lines[2]
 
 
-def test_no_checks_are_no_lines(capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_without_checks_is_empty(capsys: pytest.CaptureFixture[str]) -> None:
     nothing: list[Any] = []
     print_checks(nothing)
     assert capsys.readouterr().out == ''

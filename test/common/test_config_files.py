@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Presets are found in every kind of installation; bad files are refused in one line."""
+"""Presets are found in every kind of installation; invalid files are refused in one line."""
 
 import errno
 import os
@@ -23,7 +23,7 @@ COMMON = Path(config_files.__file__).parent
 
 @pytest.fixture
 def presets(tmp_path, monkeypatch):
-    """Stand in for the installed presets."""
+    """Replace the installed presets."""
     config = tmp_path / 'share' / 'config'
     config.mkdir(parents=True)
     for name in ('mechanism_paper', 'mechanism_prototype', 'table_ideal'):
@@ -43,7 +43,7 @@ def written(tmp_path):
 
 
 def place(prefix, package, data):
-    """Lay out an installation by hand: the package with room common, and a config folder."""
+    """Make an installation: the package with room common, and a config folder."""
     package, data = prefix / package, prefix / data
     (data / 'config').mkdir(parents=True)
     (package / 'common').mkdir(parents=True)
@@ -54,7 +54,7 @@ def place(prefix, package, data):
 
 
 def found_from(package, **environment):
-    """Ask a fresh process for the share directory of the package in one folder."""
+    """Return the share directory that a fresh process finds for a package."""
     code = 'from fourbar_ros.common.config_files import share_directory; print(share_directory())'
     inherited = {key: value for key, value in os.environ.items() if key != 'AMENT_PREFIX_PATH'}
     result = subprocess.run(
@@ -79,7 +79,7 @@ def test_share_of_a_bare_checkout_is_the_checkout(tmp_path):
     assert found_from(package) == data
 
 
-def test_share_of_a_linked_package_is_the_tree_it_links_to(tmp_path):
+def test_share_of_a_linked_package_is_the_linked_tree(tmp_path):
     source, data = place(tmp_path / 'src', 'fourbar_ros', '.')
     (data / 'package.xml').touch()
     (tmp_path / 'build').mkdir()
@@ -95,19 +95,19 @@ def test_own_prefix_comes_before_the_ament_path(tmp_path):
     assert found_from(package, AMENT_PREFIX_PATH=str(tmp_path / 'other')) == data
 
 
-def test_ament_path_serves_a_package_without_files_of_its_own(tmp_path):
+def test_ament_path_is_used_for_a_package_without_share(tmp_path):
     package, data = place(tmp_path / 'own', 'lib/python3.12/site-packages/fourbar_ros', 'none')
     _, other = place(tmp_path / 'other', 'lib/fourbar_ros', 'share/fourbar_ros')
     path = os.pathsep.join(['', str(tmp_path / 'no such'), str(tmp_path / 'other')])
     assert found_from(package, AMENT_PREFIX_PATH=path) == other
 
 
-def test_no_config_folder_at_all_is_an_error(tmp_path):
+def test_missing_config_folder_is_an_error(tmp_path):
     package, _ = place(tmp_path, 'a/b/c/d/e/f/fourbar_ros', 'none')
     assert 'no config folder of fourbar_ros' in found_from(package)
 
 
-def test_every_preset_here_is_found_and_is_a_mapping():
+def test_every_preset_is_found_and_is_a_mapping():
     files = sorted((share_directory() / 'config').glob('mechanism_*.yaml'))
     assert files
     for file in files:
@@ -122,7 +122,7 @@ def test_unknown_preset_is_refused_with_the_known_ones(presets, refuses):
 
 
 @pytest.mark.parametrize('name', ['mine.yaml', './mine', 'folder/mine', 'plain'])
-def test_path_is_taken_as_it_is(presets, tmp_path, monkeypatch, name):
+def test_path_is_not_changed(presets, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     Path('folder').mkdir()
     Path(name).touch()

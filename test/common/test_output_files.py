@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""An output file is whole or not there."""
+"""Output files and folders are complete or absent."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -33,21 +33,21 @@ def test_file_appears_when_it_is_complete(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ['out.csv']
 
 
-def test_failure_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_failure_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(GoneWrongError), atomic_file(tmp_path / 'out.csv') as file:
         file.write('half')
         raise GoneWrongError
     assert not os.listdir(tmp_path)
 
 
-def test_interrupt_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_interrupt_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), atomic_file(tmp_path / 'out.csv') as file:
         file.write('half')
         raise KeyboardInterrupt
     assert not os.listdir(tmp_path)
 
 
-def test_failure_keeps_what_was_there(tmp_path: Path) -> None:
+def test_failure_keeps_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / 'out.csv'
     path.write_text('old')
     with pytest.raises(GoneWrongError), atomic_file(path) as file:
@@ -57,7 +57,7 @@ def test_failure_keeps_what_was_there(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ['out.csv']
 
 
-def test_success_replaces_what_was_there(tmp_path: Path) -> None:
+def test_success_replaces_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / 'out.csv'
     path.write_text('old and longer')
     with atomic_file(path) as file:
@@ -78,7 +78,7 @@ def test_file_has_the_rights_of_any_other_new_file(mask: int, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize('name', ['no_such_folder/out.csv', 'file/out.csv', 'folder', 'x' * 300])
-def test_place_that_cannot_be_written_is_refused(
+def test_path_that_cannot_be_written_is_refused(
         name: str, tmp_path: Path, refuses: Refuses) -> None:
     (tmp_path / 'file').write_text('old')
     (tmp_path / 'folder').mkdir()
@@ -132,7 +132,7 @@ def test_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('error', [GoneWrongError, KeyboardInterrupt])
-def test_failure_leaves_no_folder_behind(tmp_path: Path, error: type[BaseException]) -> None:
+def test_failure_leaves_no_folder(tmp_path: Path, error: type[BaseException]) -> None:
     with pytest.raises(error), atomic_folder(tmp_path / 'out') as made:
         made.mkdir()
         (made / 'file').write_text('half')

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A setting takes values of its type within its limits, and refuses all others by name."""
+"""A setting accepts values of its type within its limits, and refuses others by name."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -68,7 +68,7 @@ def test_both_limits_are_allowed() -> None:
     assert [RATE.check(limit) for limit in (0.5, 10.0)] == [0.5, 10.0]
 
 
-def test_message_is_one_short_line_whatever_the_value(refuses: Refuses) -> None:
+def test_message_is_one_short_line_for_any_value(refuses: Refuses) -> None:
     for wrong in ('x' * 10_000, 'two\nlines', 10 ** 5000, [0] * 10_000):
         with pytest.raises(SettingError) as caught:
             RATE.check(wrong)
@@ -98,7 +98,7 @@ def test_section_is_refused_by_name_value_and_limit(
         Bearings.from_mapping(values)
 
 
-def test_declarations_carry_name_type_unit_and_limits() -> None:
+def test_declarations_have_name_type_unit_and_limits() -> None:
     rows = {row.name: row for row in settings_of(Bearings, 'table.')}
     assert list(rows) == ['table.coulomb', 'table.counts', 'table.law', 'table.width']
     assert [row.kind for row in rows.values()] == [float, int, str, float]

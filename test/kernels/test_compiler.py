@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Compiled code is kept between processes, but never longer than it is right."""
+"""Compiled code is cached between processes while its sources do not change."""
 
 import io
 import json
@@ -50,7 +50,7 @@ NOWHERE = '/dev/null/nowhere'  # below a file, so that not even root can write t
 
 
 class Tree:
-    """A tiny fourbar_ros whose kernels call across rooms, with a home to cache in."""
+    """A small fourbar_ros with kernels in two rooms, and a home for its cache."""
 
     def __init__(self, folder):
         self.folder = folder
@@ -65,7 +65,7 @@ class Tree:
         (self.root / 'plant' / 'callee.py').write_text(CALLEE.format(factor=3.0))
 
     def run(self, temporary=None, **environment):
-        """Run the kernels in a fresh process with one place to cache in."""
+        """Run the kernels in a fresh process with one cache folder."""
         inherited = {key: value for key, value in os.environ.items()
                      if not key.startswith('NUMBA_') and key != 'XDG_CACHE_HOME'}
         result = subprocess.run(
@@ -94,7 +94,7 @@ def run(tree):
 
 @pytest.fixture(scope='module')
 def common(tmp_path_factory):
-    """Make a tree for tests that look at what the same few runs left behind."""
+    """Make a tree for tests of the files of common runs."""
     return Tree(tmp_path_factory.mktemp('common'))
 
 
@@ -105,7 +105,7 @@ def first(common):
 
 @pytest.fixture(scope='module')
 def chosen(common, first):
-    """Run with a cache folder of the user's choice."""
+    """Run with a cache folder that the user has set."""
     return common.run(NUMBA_CACHE_DIR=str(common.folder / 'chosen'))
 
 
@@ -114,12 +114,12 @@ def test_second_process_loads_what_the_first_compiled(common, first):
     assert common.run()['loaded'] == 1
 
 
-def test_edited_callee_in_another_module_is_seen(run, package):
+def test_edited_callee_in_another_module_is_compiled(run, package):
     assert run()['scaled'] == 6.0
     callee = package / 'plant' / 'callee.py'
     times = callee.stat()
     callee.write_text(CALLEE.format(factor=5.0))
-    # Same size and same time: only the content can tell.
+    # Size and time are the same; only the content differs.
     os.utime(callee, ns=(times.st_atime_ns, times.st_mtime_ns))
     assert run()['scaled'] == 10.0
 
@@ -140,7 +140,7 @@ def test_cache_is_in_the_users_cache_folder(common, first):
     assert list(xdg.rglob('*.nbi'))
 
 
-def test_numba_cache_dir_of_the_user_wins(common, chosen):
+def test_numba_cache_dir_of_the_user_has_priority(common, chosen):
     assert chosen['directory'] == str(common.folder / 'chosen')
     assert list((common.folder / 'chosen').rglob('*.nbi'))
 
@@ -152,7 +152,7 @@ def test_other_code_keeps_its_own_cache_folder(common, first, chosen):
 
 @pytest.mark.parametrize('variables', [
     {'HOME': NOWHERE, 'XDG_CACHE_HOME': NOWHERE}, {'NUMBA_CACHE_DIR': NOWHERE}])
-def test_without_a_writable_cache_a_temporary_folder_serves(run, tmp_path, variables):
+def test_temporary_folder_replaces_a_cache_that_is_not_writable(run, tmp_path, variables):
     first, second = run(**variables), run(**variables)
     assert Path(first['directory']).is_relative_to(tmp_path / f'fourbar_ros-{os.getuid()}')
     assert len(first['notes']) == 1 and first['directory'] in first['notes'][0]
@@ -168,14 +168,14 @@ def test_temporary_folder_that_others_can_write_to_is_not_used(run, tmp_path):
     assert not list(trap.iterdir())
 
 
-def test_with_nothing_writable_it_still_works(run):
+def test_kernels_run_without_a_writable_folder(run):
     result = run(temporary=NOWHERE, HOME=NOWHERE, XDG_CACHE_HOME=NOWHERE)
     assert result['scaled'] == 6.0
     assert result['directory'] == 'None'
     assert len(result['notes']) == 1 and 'every start compiles' in result['notes'][0]
 
 
-def test_folders_unused_for_long_are_dropped_and_others_kept(run, tmp_path):
+def test_old_folders_are_removed_and_others_kept(run, tmp_path):
     cache = tmp_path / 'home' / '.cache' / 'fourbar_ros'
     long_ago = 1.6e9
     for name in ('0123456789abcdef', 'fedcba9876543210', 'not ours'):
@@ -190,7 +190,7 @@ def test_folders_unused_for_long_are_dropped_and_others_kept(run, tmp_path):
 
 
 def test_compilation_is_announced_once() -> None:
-    """One line however many kernels there are, and none where the code is there already."""
+    """One line announces any number of kernels; cached code has no announcement."""
     @compiler.kernel(cache=False)
     def halve(number: float) -> float:
         return 0.5 * number

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Copies of the tree to install from, and children that know nothing of this installation."""
+"""Copies of the tree for installations, and processes without this installation."""
 
 from concurrent.futures import ThreadPoolExecutor
 import os
@@ -21,7 +21,7 @@ LEAKS = (
 
 @pytest.fixture(scope='session')
 def copy_tree():
-    """Return a function that copies the tree to a new folder, without what .gitignore lists."""
+    """Return a function that copies the tree to a new folder, without ignored files."""
     ignored = [line.rstrip('/') for line in (ROOT / '.gitignore').read_text().split()]
 
     def copy(target):
@@ -33,9 +33,9 @@ def copy_tree():
 @pytest.fixture(scope='session')
 def check():
     """
-    Return a function that runs a command, which must succeed, and returns what it printed.
+    Return a function that runs a command, checks its success, and returns its output.
 
-    What the wheels and a sourced ROS leave in the environment is dropped.
+    The environment has no variables of this installation or of a sourced ROS.
     """
     def check(*command, cwd='/', **variables):
         inherited = {key: value for key, value in os.environ.items() if key not in LEAKS}
@@ -55,7 +55,7 @@ def executables():
 
 @pytest.fixture(scope='session')
 def check_help(check):
-    """Return a function that asks each of some executables for --help, which must be printed."""
+    """Return a function that checks that executables print --help."""
     def check_help(*prefix, folder, names, **options):
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             texts = pool.map(

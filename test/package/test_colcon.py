@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A colcon workspace builds, finds, runs and tests the package, linked or copied."""
+"""Build, run and test the package in a colcon workspace, linked or copied."""
 
 import os
 from pathlib import Path
@@ -14,15 +14,15 @@ pytestmark = pytest.mark.package
 
 CASE = Path(__file__).parents[2] / 'config' / 'reference' / 'paper_pair_ac.json'
 COLCON = (sys.executable, '-m', 'colcon', '--log-base', 'log')
-# Runs what follows in the environment of the workspace.
+# Prefix of commands in the environment of the workspace.
 SOURCED = ('sh', '-c', '. install/setup.sh && exec "$@"', 'sh')
-# The Python that ran colcon must also be the one that `env python3` finds.
+# `env python3` must find the Python of colcon.
 PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']])
 
 
 @pytest.fixture(scope='module', params=['copied', 'linked'])
 def workspace(request, tmp_path_factory, copy_tree, check):
-    """Build a copy of the tree in a workspace of its own, and return the workspace."""
+    """Build a copy of the tree in its own workspace, and return the workspace."""
     workspace = tmp_path_factory.mktemp(request.param)
     copy_tree(workspace / 'src' / 'fourbar_ros')
     options = ['--symlink-install'] if request.param == 'linked' else []
@@ -65,7 +65,7 @@ def test_code_and_presets_are_those_of_the_workspace(workspace, check):
 
 def test_colcon_test_runs_tests_that_pass(workspace, check):
     results = workspace / 'build' / 'fourbar_ros' / 'pytest.xml'
-    # A quick part: all others ran against the installed package already.
+    # One quick file: the other tests run against the installed package elsewhere.
     check(*COLCON, 'test', '--return-code-on-test-failure', '--pytest-args',
           '-m', 'not package and not node', 'test/common/test_config_files.py',
           cwd=workspace, PATH=PATH)

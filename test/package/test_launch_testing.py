@@ -63,7 +63,7 @@ def counted(text: str, word: str) -> int:
 
 def run_pytest(*arguments: str, environment: dict[str, str] | None = None
                ) -> subprocess.CompletedProcess[str]:
-    """Run pytest on the tree in a process of its own."""
+    """Run pytest on the tree in its own process."""
     return subprocess.run(
         [sys.executable, '-P', '-m', 'pytest', '-q', '-p', 'no:cacheprovider', *arguments],
         cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)

@@ -20,11 +20,11 @@ CASE = ROOT / 'config' / 'reference' / 'paper_pair_ac.json'
 
 @pytest.fixture(scope='module')
 def prefix(tmp_path_factory, copy_tree, check):
-    """Install a copy of the tree, with the dependencies it asks for, and return the prefix."""
+    """Install a copy of the tree with its dependencies, and return the prefix."""
     tree = copy_tree(tmp_path_factory.mktemp('pip') / 'tree')
     prefix = tree.parent / 'prefix'
     check(sys.executable, '-m', 'venv', prefix)
-    # Not compiled: most of what comes along is never imported here.
+    # Most modules are never imported, so pip does not compile them.
     check(prefix / 'bin' / 'python', '-m', 'pip', 'install', '--quiet', '--no-compile', '.',
           cwd=tree)
     return prefix
@@ -51,7 +51,7 @@ def test_fourbar_has_help_and_lists_every_command(prefix, executables, check):
 
 
 def test_executable_finds_its_python_when_another_one_starts_it(folder, check):
-    # As `ros2 run` does with the Python of the system.
+    # `ros2 run` starts it with the Python of the system.
     other = check(sys.executable, '-c', 'import sys; print(sys._base_executable)').strip()
     assert not Path(other).is_relative_to(folder.parents[1])
     assert 'usage' in check(other, folder / 'simulate', '--help')
@@ -68,10 +68,10 @@ def test_simulate_writes_the_times_of_the_case(folder, check, tmp_path):
     assert [float(row[0]) for row in rows] == pytest.approx(json.loads(CASE.read_text())['t'])
 
 
-def test_share_holds_what_the_tree_holds(prefix):
+def test_share_has_the_files_of_the_tree(prefix):
     share = prefix / 'share' / 'fourbar_ros'
     for name in ('config', 'launch'):
-        # Files only: compiled launch files may be there in a folder of their own.
+        # Only files: compiled launch files may be in a folder.
         expected, found = (
             {path.name: path.read_bytes() for path in folder.glob('*') if path.is_file()}
             for folder in (ROOT / name, share / name))
@@ -80,7 +80,7 @@ def test_share_holds_what_the_tree_holds(prefix):
     assert (prefix / 'share/ament_index/resource_index/packages/fourbar_ros').is_file()
 
 
-def test_presets_are_found_from_anywhere(prefix, check, tmp_path):
+def test_presets_are_found_from_any_folder(prefix, check, tmp_path):
     code = ('from fourbar_ros.common.config_files import config_file as f; '
             'print(f("mechanism", "paper"))')
     found = check(prefix / 'bin' / 'python', '-c', code, cwd=tmp_path).strip()
