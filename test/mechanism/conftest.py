@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Random linkages, motion without torque and the equations of Kane's method, for the tests."""
+"""Random linkages, free motion, and the equations of Kane's method."""
 
 from collections.abc import Callable
 from typing import Any
@@ -28,7 +28,7 @@ NONE = [0.0] * 4
 
 
 def _random_bodies(rng: np.random.Generator, lengths: Array) -> Mechanism:
-    """Hang masses of about 1 kg, anywhere near the links, on lengths of about 1 m."""
+    """Draw masses of about 1 kg with mass centres near the links, for lengths of about 1 m."""
     masses = rng.uniform(0.5, 2.0, 4)
     inertias = masses * lengths**2 * rng.uniform(0.05, 0.3, 4)
     along = rng.uniform(0.2, 0.8, 4) * lengths
@@ -47,7 +47,7 @@ def _random_linkage(rng: np.random.Generator) -> Mechanism:
 
 
 def _random_parallelogram(rng: np.random.Generator) -> Mechanism:
-    """Draw a parallelogram, every other time a rhombus, with four different bodies."""
+    """Draw a parallelogram, in half of the cases a rhombus, with four different bodies."""
     length_a = rng.uniform(0.5, 1.5)
     length_b = length_a if rng.random() < 0.5 else rng.uniform(0.5, 1.5)
     return _random_bodies(rng, np.array([length_a, length_b, length_a, length_b]))
@@ -82,7 +82,7 @@ def _move_freely(linkage: Mechanism, start: Array, step: float, steps: int) -> A
         1.5 * step, linkage.constants, NOTHING)
 
 
-# For the tests: what they may ask of the fixtures.
+# Types of the fixtures, for the tests.
 Draw = Callable[[np.random.Generator], Mechanism]
 
 
@@ -128,14 +128,14 @@ def _chain(linkage: Mechanism, angles: Array, gaps: Array) -> Array:
 
 
 def _chain_motion(linkage: Mechanism, state: Array) -> tuple[Array, Array, Array, Array]:
-    """Return positions and velocities (4,) of the mass centres, gaps and gap rates (3,)."""
+    """Return positions, velocities (4,) of the mass centres, gaps and gap rates (3,)."""
     turn, share = np.exp(1j * state[LINK_ANGLES]), linkage.link_masses / linkage.link_masses.sum()
     parts = []
     for unit, part, centre in ((turn, JOINT_GAPS, CENTRE_POSITION),
                                (1j * state[LINK_RATES] * turn, JOINT_GAP_RATES, CENTRE_VELOCITY)):
         open_1, open_2, open_4 = state[part].view(complex)
         signed = linkage.link_lengths * unit
-        # Joint 3 is open by what the other joints and the links leave.
+        # The gap of joint 3 follows from the other gaps and the links.
         open_3 = signed[0] + open_4 + signed[3] - open_1 - signed[1] - open_2 - signed[2]
         gaps = np.array([open_1, open_2, open_3])
         places = _chain(linkage, unit, gaps)
@@ -145,7 +145,7 @@ def _chain_motion(linkage: Mechanism, state: Array) -> tuple[Array, Array, Array
 
 
 def _pairs(values: Array) -> list[float]:
-    """Return complex numbers as x and y in turn."""
+    """Return complex numbers as a flat list of x and y."""
     return np.ascontiguousarray(values).view(float).tolist()
 
 
@@ -172,7 +172,7 @@ def kane_accelerations_under_loads() -> Callable[..., Array]:
     from fourbar_ros.studies.independent import kane
 
     def solve(linkage: Mechanism, state: Array, torques: Array, effects: dict[str, Any]) -> Array:
-        # Links feel the opposite of the motor torques; the wheels are left out.
+        # Motor torques act on the links with the opposite sign; there are no wheels.
         loads = {**effects, 'link_torques': effects['link_torques'] - torques}
         parameters = [*kane.parameters_of(linkage)[:20], *(0.0,) * 4]
         speeds = _chain_motion(linkage, state)[1]
@@ -194,7 +194,7 @@ def kane_compliant_motion() -> Callable[..., Array]:
     """
     Integrate Kane's equations of a linkage with compliant joints by SciPy.
 
-    Returns places and angles (12,), then speeds (12,) of the links after a time.
+    The function returns positions and angles (12,), and speeds (12,) of the links after a time.
     """
     pytest.importorskip('sympy')
     from fourbar_ros.studies.independent import kane
@@ -214,7 +214,7 @@ def kane_compliant_motion() -> Callable[..., Array]:
         nothing['smoothing'] = [1.0]
 
         def slope(t: float, state: Array) -> Array:
-            # Place of A, gaps, angles; then their rates.
+            # The state is position of A, gaps, angles, and their rates.
             loads = {**nothing, 'link_torques': (-drive * np.cos(omega * t + phase)).tolist()}
             row = state.tolist()
             matrix, forcing = equations.evaluate(

@@ -1,6 +1,6 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Many motions at once: the same bytes as one by one."""
+"""Batches of motions have the same bytes as single motions."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -34,7 +34,7 @@ def campaign(random_linkage: Draw, random_state: Callable[..., Array]
 def test_batch_gives_the_bytes_of_single_motions(
     threads: int, campaign: tuple[list[Mechanism], Array, Array],
 ) -> None:
-    """Each with constants and surroundings of its own."""
+    """Each motion has its own constants and surroundings."""
     linkages, states, torques = campaign
     constants = np.array([linkage.constants for linkage in linkages])
     around = np.array([surroundings(joint_viscous=0.01 * n) for n in range(9)])
@@ -59,10 +59,10 @@ def test_one_linkage_serves_all(campaign: tuple[list[Mechanism], Array, Array]) 
     assert states[4].tobytes() == alone.tobytes()
 
 
-def test_rigid_and_soft_linkages_and_prescribed_wheels_go_together(
+def test_batch_of_rigid_and_compliant_linkages_and_prescribed_wheels(
     campaign: tuple[list[Mechanism], Array, Array],
 ) -> None:
-    """What a row needs is in its constants."""
+    """The constants of each row select its equations."""
     linkages, states, torques = campaign
     constants = np.array([
         replace(linkage, joint_stiffness=[1e3 * (n + 1)] * 4).constants if n % 3 == 0
@@ -85,14 +85,14 @@ def test_batch_may_hold_one_state(campaign: tuple[list[Mechanism], Array, Array]
 def test_batches_of_two_threads_wait_for_each_other(
     campaign: tuple[list[Mechanism], Array, Array],
 ) -> None:
-    """And each does what is asked of it."""
+    """Each batch of concurrent threads has the right result."""
     linkages, states, torques = campaign
     constants = linkages[0].constants
     states[:] = states[0]
     alone = states.copy()
     for n in range(9):
         move_held(alone[n], torques[n], 1e-3, 100, constants, NOTHING)
-    # Times seven, so that they are busy for as long as it takes to start the others.
+    # Seven copies, so that each thread runs while the others start.
     parts = [np.repeat(states[[n]], 63, axis=0) for n in range(4)]
     loads = [np.tile(np.roll(torques, n, axis=0), (7, 1)) for n in range(4)]
     threads = [Thread(target=move_batch, args=(part, load, 1e-3, 100, constants, NOTHING))
@@ -111,11 +111,11 @@ def test_batches_of_two_threads_wait_for_each_other(
     lambda states: states.astype(np.float32),
     lambda states: np.broadcast_to(states, states.shape)],
     ids=['rows', 'columns', 'integers', 'single', 'read-only'])
-def test_states_that_lie_in_another_way_are_refused(
+def test_states_of_another_layout_are_refused(
     made: Callable[[Array], Array], campaign: tuple[list[Mechanism], Array, Array],
     refuses: Callable[..., AbstractContextManager[None]],
 ) -> None:
-    """Not done by halves, and nothing is compiled for them."""
+    """A refused call changes no state."""
     linkages, states, torques = campaign
     given = made(states)
     before = given.copy()
@@ -124,7 +124,7 @@ def test_states_that_lie_in_another_way_are_refused(
     np.testing.assert_array_equal(given, before)
 
 
-def test_torques_may_lie_in_any_way(campaign: tuple[list[Mechanism], Array, Array]) -> None:
+def test_torques_may_have_any_layout(campaign: tuple[list[Mechanism], Array, Array]) -> None:
     linkages, states, torques = campaign
     others = states.copy()
     move_batch(states, torques, 1e-3, 10, linkages[0].constants, NOTHING)
@@ -132,7 +132,7 @@ def test_torques_may_lie_in_any_way(campaign: tuple[list[Mechanism], Array, Arra
     assert others.tobytes() == states.tobytes()
 
 
-def test_no_states_are_no_work(campaign: tuple[list[Mechanism], Array, Array]) -> None:
+def test_empty_batch_is_allowed(campaign: tuple[list[Mechanism], Array, Array]) -> None:
     constants = campaign[0][0].constants
     move_batch(np.empty((0, STATE_SIZE)), np.empty((0, 4)), 1e-3, 1, constants, NOTHING)
 
@@ -143,7 +143,7 @@ def test_no_states_are_no_work(campaign: tuple[list[Mechanism], Array, Array]) -
     ((3, STATE_SIZE), (4,), 1, 1), ((3, STATE_SIZE), (3, 3), 1, 1),
     ((3, STATE_SIZE), (3, 4), 2, 1), ((3, STATE_SIZE), (3, 4), 4, 1),
     ((3, STATE_SIZE), (3, 4), 0, 1), ((3, STATE_SIZE), (3, 4), 1, 2)])
-def test_what_does_not_fit_is_refused(
+def test_wrong_shapes_are_refused(
     states: tuple[int, ...], torques: tuple[int, ...], mechanisms: int, surrounded: int,
     paper: Mechanism, refuses: Callable[..., AbstractContextManager[None]],
 ) -> None:

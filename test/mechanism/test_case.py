@@ -1,6 +1,6 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Case files, good and bad, prescribed wheels in them, and which branch a motion was on."""
+"""Case files: valid and invalid ones, prescribed wheels, and the branch of a motion."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -24,7 +24,7 @@ COSINE = {'amplitude': [10.0], 'frequency_hz': [0.5], 'phase': [0.0]}
 
 @pytest.fixture
 def write(tmp_path: Path) -> Callable[..., Path]:
-    """Write a case of the paper's linkage, some of its keys replaced."""
+    """Return a function that writes a case of the linkage of the paper with some changed keys."""
     paper = load_mechanism('paper')
     names = ('link_lengths', 'link_masses', 'link_inertias', 'com_positions', 'flywheel_inertias')
 
@@ -41,7 +41,7 @@ def write(tmp_path: Path) -> Callable[..., Path]:
 
 # --- Good files -------------------------------------------------------------------------------
 
-def test_file_is_taken_as_it_is(write: Callable[..., Path]) -> None:
+def test_values_of_a_file_are_read(write: Callable[..., Path]) -> None:
     torque = {'amplitude': [1e-5, 2e-5, 3e-5, 4e-5], 'frequency_hz': [0.1, 0.2, 0.3, 0.4],
               'phase': [1.0, 2.0, 3.0, 4.0]}
     initial = {'link_angles': [0.1, 1.0, 0.1, 1.0], 'link_rates': [0.2, 0.3, 0.2, 0.3],
@@ -53,14 +53,14 @@ def test_file_is_taken_as_it_is(write: Callable[..., Path]) -> None:
     assert not case.prescribed.any()
 
 
-def test_rates_and_wheel_speeds_are_zero_unless_told(write: Callable[..., Path]) -> None:
+def test_rates_and_wheel_speeds_are_zero_by_default(write: Callable[..., Path]) -> None:
     case = load_case(write())
     np.testing.assert_array_equal(case.link_rates, NONE)
     np.testing.assert_array_equal(case.flywheel_speeds_absolute, NONE)
 
 
-def test_other_keys_are_left_alone(write: Callable[..., Path]) -> None:
-    """A file may carry what it expects, and say what it is."""
+def test_other_keys_are_ignored(write: Callable[..., Path]) -> None:
+    """A file may contain expected results and a description."""
     write_expected = write(note='from elsewhere', link_angles=[[0.0] * 4] * 3)
     assert load_case(write_expected).times.size == 3
 
@@ -73,10 +73,10 @@ def test_reference_motions_can_be_read(path: Path) -> None:
 def test_wheel_angle_in_a_file_moves_the_wheel(write: Callable[..., Path]) -> None:
     angle = {'flywheels': ['flywheel_b'], **COSINE}
     motion = simulate(load_case(write(wheel_angle=angle)))
-    # 10 cos(pi t), up to a constant.
+    # The law is 10 cos(pi t), up to a constant.
     np.testing.assert_allclose(
         motion.flywheel_angles[:, 1], [0.0, -10.0, -20.0], rtol=0.0, atol=1e-9)
-    # A wheel that nobody turns keeps its direction in the table frame.
+    # A wheel without torque keeps its orientation in the table frame.
     np.testing.assert_allclose(
         motion.flywheel_angles[:, 0], -motion.link_angles[:, 0], rtol=0.0, atol=1e-12)
 
@@ -93,8 +93,8 @@ def test_laws_belong_to_the_wheels_in_the_order_named(write: Callable[..., Path]
     np.testing.assert_array_equal(case.phase, [0.0, 0.5, 0.0, 1.0])
 
 
-def test_prescribed_wheel_starts_as_its_law_has_it(write: Callable[..., Path]) -> None:
-    """Not as the initial state has it: at the first time, 0.25 s, the law is at full speed."""
+def test_prescribed_wheel_starts_at_the_speed_of_its_law(write: Callable[..., Path]) -> None:
+    """The speed of the initial state is ignored; at 0.25 s the law has its peak speed."""
     initial = {'link_angles': [0.0, 1.0, 0.0, 1.0], 'link_rates': [0.3, 0.0, 0.3, 0.0],
                'flywheel_speeds_absolute': [77.0] * 4}
     angle = {'flywheels': ['flywheel_a'], 'amplitude': [10.0], 'frequency_hz': [1.0],
@@ -102,7 +102,7 @@ def test_prescribed_wheel_starts_as_its_law_has_it(write: Callable[..., Path]) -
     motion = simulate(load_case(write(initial=initial, wheel_angle=angle, t=[0.25, 0.5])))
     assert motion.flywheel_speeds_absolute[0, 0] == pytest.approx(0.3 - 20.0 * np.pi, rel=1e-14)
     np.testing.assert_array_equal(motion.flywheel_speeds_absolute[0, 1:], [77.0] * 3)
-    # 10 cos(pi) - 10 cos(pi / 2); Simpson's rule leaves 1e-12 of it.
+    # The change is 10 cos(pi) - 10 cos(pi / 2), with a relative error of 1e-12.
     assert motion.flywheel_angles[1, 0] == pytest.approx(-10.0, rel=1e-10)
 
 
@@ -191,7 +191,7 @@ def test_bad_files_are_refused(
 def test_torque_on_one_of_four_prescribed_wheels_is_refused(
     write: Callable[..., Path], refuses: Refuses,
 ) -> None:
-    """As it is with three."""
+    """The refusal is the same as for three prescribed wheels."""
     cosine = {name: value * 4 for name, value in COSINE.items()}
     angle = {'flywheels': list(FLYWHEEL_NAMES), **cosine}
     torque = {**cosine, 'amplitude': [0.0, 1.0, 0.0, 0.0]}

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Joints that give: an independent derivation, conservation, the rigid limit, change points."""
+"""Compliant joints: independent derivation, conservation, rigid limit, change points."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -44,22 +44,22 @@ FREE = np.zeros(4, dtype=bool)
 
 def soften(linkage: Mechanism, stiffness: float, ratio: float = 0.0) -> Mechanism:
     """
-    Give all joints one stiffness [N/m] and damping.
+    Return a linkage with equal stiffness [N/m] and damping of all joints.
 
-    :param ratio: of the damping to that of 1 kg on one joint which would just not swing.
+    :param ratio: damping ratio of 1 kg on one joint.
     """
     return replace(linkage, joint_stiffness=[stiffness] * 4,
                    joint_damping=[2.0 * ratio * np.sqrt(stiffness)] * 4)
 
 
 def with_uneven_joints(rng: np.random.Generator, linkage: Mechanism) -> Mechanism:
-    """Give every joint a stiffness and a damping of its own."""
+    """Return a linkage with unequal stiffness and damping of the joints."""
     return replace(linkage, joint_stiffness=10.0**rng.uniform(2.0, 3.0, 4),
                    joint_damping=rng.uniform(0.0, 2.0, 4))
 
 
 def opened(rng: np.random.Generator, state: Array) -> Array:
-    """Open the joints of a state by about a centimetre, and let the whole travel."""
+    """Open the joints of a state by about a centimetre, and add a motion of the whole."""
     state = state.copy()
     for part, size in ((CENTRE_POSITION, 1.0), (CENTRE_VELOCITY, 1.0), (JOINT_GAPS, 0.01),
                        (JOINT_GAP_RATES, 0.1)):
@@ -69,7 +69,7 @@ def opened(rng: np.random.Generator, state: Array) -> Array:
 
 def held(linkage: Mechanism, start: Array, step: float, steps: int, torques: Array = NONE
          ) -> Array:
-    """Return the states (steps + 1, STATE_SIZE) under torques that are held."""
+    """Return the states (steps + 1, STATE_SIZE) under constant torques."""
     return move_with_cosines(
         start, step * np.arange(steps + 1), torques, NONE, NONE, 1.5 * step, linkage.constants,
         NOTHING)
@@ -78,7 +78,7 @@ def held(linkage: Mechanism, start: Array, step: float, steps: int, torques: Arr
 # --- An independent derivation ----------------------------------------------------------------
 
 def bodies_of(linkage: Mechanism, state: Array) -> Array:
-    """Return a state as the other derivation has it."""
+    """Return a state in the coordinates of the independent derivation."""
     place, speed = body_motion(linkage, state)
     return np.concatenate([np.column_stack([place, state[LINK_ANGLES]]).ravel(),
                            np.column_stack([speed, state[LINK_RATES]]).ravel()])
@@ -94,7 +94,7 @@ def test_motion_agrees_with_an_independent_derivation(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
     kane_compliant_motion: Callable[..., Array],
 ) -> None:
-    """Driven and prescribed wheels in any mix, joints of unequal stiffness and damping."""
+    """Wheels are driven or prescribed in any mix; joints are unequal."""
     rng = np.random.default_rng(seed)
     linkage = with_uneven_joints(rng, random_linkage(rng))
     start = opened(rng, random_state(rng, linkage))
@@ -103,8 +103,9 @@ def test_motion_agrees_with_an_independent_derivation(
     time, step = 0.1, 0.02 / constants.fastest_joint_mode
     end = move_with_cosines(start, np.array([0.0, time]), *drive, step, constants, NOTHING)[-1]
     expected = kane_compliant_motion(linkage, start, time, *drive, prescribed)
-    # A swing of frequency w is late by w T (w h)^4 / 120 rad after a time T. Joints open by 0.01 m
-    # swing links of 0.5 m and more by 0.03 rad at most, at w times that.
+    # The phase error of an oscillation of frequency w is w T (w h)^4 / 120 rad after a time T.
+    # With gaps of 0.01 m links of at least 0.5 m oscillate by at most 0.03 rad, and their rates by
+    # w times that.
     late = constants.fastest_joint_mode * time * 0.02**4 / 120.0
     error = np.abs(bodies_of(linkage, end) - expected)
     assert error[:12].max() < 0.03 * late + 1e-11
@@ -129,7 +130,7 @@ def test_integration_is_of_order_four(
             start, np.array([0.0, time]), *drive, longest / parts * (1.0 + 1e-9),
             linkage.constants, NOTHING)[-1]) - exact).max() for parts in (1, 2, 4)]
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
-    # The next order shows as a tenth or so at these steps.
+    # The next order contributes about a tenth at these steps.
     np.testing.assert_allclose(orders, 4.0, rtol=0.0, atol=0.3)
 
 
@@ -137,7 +138,7 @@ def test_integration_is_of_order_four(
 def test_held_wheels_count_as_part_of_their_links(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """Prescribed not to move, with nothing left that could drive them."""
+    """A wheel that is prescribed at rest has no torque on its link beyond its inertia."""
     rng = np.random.default_rng(seed)
     linkage = with_uneven_joints(rng, random_linkage(rng))
     start = opened(rng, random_state(rng, linkage))
@@ -149,7 +150,7 @@ def test_held_wheels_count_as_part_of_their_links(
     ours, expected = start.copy(), start.copy()
     move_held(ours, torques, 1e-3, 100, linkage.constants_with(fixed), NOTHING)
     move_held(expected, torques, 1e-3, 100, heavier.constants, NOTHING)
-    # The very same numbers, since these steps are short enough to be taken in one part.
+    # The numbers are equal, since these steps are not divided.
     np.testing.assert_array_equal(ours[:8], expected[:8])
     np.testing.assert_array_equal(ours[WHEEL_SPEEDS][fixed], ours[LINK_RATES][fixed])
     np.testing.assert_array_equal(ours[WHEEL_ANGLES][fixed], start[WHEEL_ANGLES][fixed])
@@ -157,7 +158,7 @@ def test_held_wheels_count_as_part_of_their_links(
 
 # --- Conservation -----------------------------------------------------------------------------
 
-# Of the fastest swing in one step, of which the method takes (w h)^6 / 144 of its size.
+# Phase of the fastest oscillation per step [rad]; the method damps it by (w h)^6 / 144.
 FINE = 0.05
 STEPS = 1000
 TAKEN = STEPS * FINE**6 / 144.0
@@ -176,7 +177,7 @@ def swinging(seed: int, random_linkage: Draw, random_state: Callable[..., Array]
 
 
 def opening(linkage: Mechanism, state: Array) -> Array:
-    """Return the slip of joints 1 to 4 in the middle of their gaps, (4,) complex [m/s]."""
+    """Return the opening speeds of joints 1 to 4 amid their gaps, (4,) complex [m/s]."""
     rod = linkage.link_lengths * np.exp(1j * state[LINK_ANGLES])
     rates = state[LINK_RATES]
     slips = []
@@ -196,10 +197,10 @@ def opening(linkage: Mechanism, state: Array) -> Array:
 def test_mass_centre_moves_uniformly(
     seed: int, damped: bool, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """Linear momentum is a sum of the speeds, which every Runge-Kutta method keeps."""
+    """Every Runge-Kutta method conserves linear momentum, a linear function of the state."""
     linkage, states, step = swinging(seed, random_linkage, random_state, damped)
     start, end = states[0], states[-1]
-    # One rounding of some 1 kg m/s in each of a thousand steps, at worst all the same way.
+    # Bound: a thousand steps with one rounding of 1 kg m/s of one sign.
     np.testing.assert_allclose(
         linear_momentum(linkage, end), linear_momentum(linkage, start), rtol=0.0, atol=1e-12)
     way = STEPS * step * start[CENTRE_VELOCITY]
@@ -209,29 +210,29 @@ def test_mass_centre_moves_uniformly(
 
 @pytest.mark.parametrize('damped', [False, True])
 @pytest.mark.parametrize('seed', SEEDS)
-def test_angular_momentum_is_kept(
+def test_angular_momentum_is_conserved(
     seed: int, damped: bool, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
     linkage, states, _ = swinging(seed, random_linkage, random_state, damped)
     momentum = [total_angular_momentum(linkage, state) for state in states[::50]]
-    # Each of a thousand steps rounds some 5 kg m^2/s.
+    # Bound: a thousand roundings of 5 kg m^2/s.
     np.testing.assert_allclose(momentum, momentum[0], rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_energy_is_kept_without_damping(
+def test_energy_is_conserved_without_damping(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
     linkage, states, _ = swinging(seed, random_linkage, random_state)
     energies = [mechanical_energy(linkage, state) for state in states[::50]]
-    # What the swings hold: the springs, and 1 kg in each joint.
+    # Energy of the oscillations: the springs, and 1 kg at each joint.
     stretch, speed = joint_gaps(linkage, states[0]) @ [1.0, 1j], opening(linkage, states[0])
     swings = 0.5 * float(linkage.joint_stiffness @ np.abs(stretch)**2 + (np.abs(speed)**2).sum())
     np.testing.assert_allclose(energies, energies[0], rtol=0.0, atol=TAKEN * swings)
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_damping_takes_energy_at_every_step(
+def test_damping_reduces_the_energy_at_every_step(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
     linkage, states, _ = swinging(seed, random_linkage, random_state, damped=True)
@@ -240,16 +241,16 @@ def test_damping_takes_energy_at_every_step(
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_damping_takes_what_the_dampers_work_is(
+def test_energy_loss_is_the_work_of_the_dampers(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """Their power, damping times opening speed squared, added up by Simpson's rule."""
+    """The power is damping times opening speed squared, integrated by Simpson's rule."""
     linkage, states, step = swinging(seed, random_linkage, random_state, damped=True)
     lost = mechanical_energy(linkage, states[0]) - mechanical_energy(linkage, states[-1])
     power = np.array([linkage.joint_damping @ np.abs(opening(linkage, x))**2 for x in states])
     work = step / 3.0 * (
         power[0] + 4.0 * power[1::2].sum() + 2.0 * power[2:-1:2].sum() + power[-1])
-    # The rule leaves (2 w h)^4 / 180 of what swings at twice the frequency.
+    # The relative error of the rule is (2 w h)^4 / 180 at twice the frequency.
     assert lost == pytest.approx(work, rel=(2.0 * FINE)**4 / 180.0)
     assert lost > 0.01
 
@@ -257,14 +258,14 @@ def test_damping_takes_what_the_dampers_work_is(
 # --- The rigid limit --------------------------------------------------------------------------
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_stiff_joints_come_near_rigid_ones(
+def test_stiff_joints_approach_rigid_ones(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
     move_freely: Callable[..., Array],
 ) -> None:
     """
-    Ten times the stiffness, a tenth of the difference in angle, over two decades.
+    The difference in angle is inverse to the stiffness over two decades.
 
-    The joints are open by force over stiffness, once damping has taken the first swing.
+    After the transient the gaps are force over stiffness.
     """
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
@@ -275,7 +276,7 @@ def test_stiff_joints_come_near_rigid_ones(
         end = held(soften(linkage, stiffness, 1.0), start, 1e-3, 300)[-1]
         apart.append(np.abs(end[LINK_ANGLES] - rigid[LINK_ANGLES]).max())
     decades = np.log10(np.array(apart[:-1]) / apart[1:])
-    # At 1e4 N/m the next power of 1 / stiffness still shows as a few hundredths.
+    # At 1e4 N/m the next power of 1 / stiffness contributes a few hundredths.
     np.testing.assert_allclose(decades, 1.0, rtol=0.0, atol=0.1)
 
 
@@ -296,12 +297,12 @@ def test_static_load_opens_joints_by_force_over_stiffness(
     a, b = 0.1 * np.exp(0.2j), 0.1 * np.exp(1.2j)
     force = np.hypot(*np.linalg.solve([[-a.imag, a.real], [b.imag, -b.real]], torques[:2]))
     gaps = np.hypot(*joint_gaps(linkage, state).T)
-    # Open joints turn the links by that much, relative to their length, and with them the force.
+    # The gaps turn the links by gap over length, and the force too.
     np.testing.assert_allclose(gaps * stiffness, force, rtol=gaps.max() / 0.1)
 
 
 def near_alignment(link: int, mismatch: float, stiffness: float) -> tuple[Mechanism, Array]:
-    """Let a rhombus of 1 m and 4 kg, but for one length, come to theta = 0 at 0.3 rad/s."""
+    """Return an almost equal-sided rhombus (1 m, 4 kg) near theta = 0 with a rate of 0.3 rad/s."""
     lengths = np.ones(4)
     lengths[link] += mismatch
     linkage = Mechanism(
@@ -316,11 +317,11 @@ def near_alignment(link: int, mismatch: float, stiffness: float) -> tuple[Mechan
 
 @pytest.mark.parametrize('mismatch', [1e-3, -1e-3])
 @pytest.mark.parametrize('link', range(4))
-def test_soft_rhombus_that_does_not_quite_match_passes(link: int, mismatch: float) -> None:
+def test_soft_rhombus_with_a_mismatch_passes(link: int, mismatch: float) -> None:
     """
-    In line, four springs take up the mismatch x: they hold stiffness x^2 / 8.
+    In line, four springs have the mismatch x and the energy stiffness x^2 / 8.
 
-    At 1e3 N/m that is a hundredth of the energy with which theta comes along, 0.015 J.
+    At 1e3 N/m that is a hundredth of the kinetic energy of theta, 0.015 J.
     """
     linkage, state = near_alignment(link, mismatch, 1e3)
     move_held(state, NONE, 1e-3, 2000, linkage.constants, NOTHING)
@@ -332,14 +333,14 @@ def test_soft_rhombus_that_does_not_quite_match_passes(link: int, mismatch: floa
 
 @pytest.mark.parametrize('stiffness', [1e7, np.inf])
 @pytest.mark.parametrize('link', range(4))
-def test_stiff_rhombus_that_does_not_quite_match_folds(link: int, stiffness: float) -> None:
-    """Two pairs of links, a with b and c with d; the sign of the mismatch decides which way."""
+def test_stiff_rhombus_with_a_mismatch_folds(link: int, stiffness: float) -> None:
+    """The pairs are then a with b and c with d; the sign of the mismatch decides the side."""
     ways = []
     for mismatch in (1e-3, -1e-3):
         linkage, state = near_alignment(link, mismatch, stiffness)
         move_held(state, NONE, 1e-3, 2000, linkage.constants, NOTHING)
         a, b, c, d = state[LINK_ANGLES]
-        # Theta times the angle between the pairs is about the mismatch over the length.
+        # Theta times the angle between the pairs is about mismatch over length.
         assert abs(b - a) < 0.01
         assert abs(d - c) < 0.01
         ways.append(c - a)
@@ -349,7 +350,7 @@ def test_stiff_rhombus_that_does_not_quite_match_folds(link: int, stiffness: flo
 
 @pytest.mark.parametrize('change_point', [0.0, np.pi])
 def test_soft_rhombus_passes_change_points_as_a_parallelogram(change_point: float) -> None:
-    """Exactly equal lengths leave the springs at rest but for what the turning asks of them."""
+    """With equal lengths the springs carry only the forces of the rotation."""
     linkage = soften(Mechanism(  # type: ignore[arg-type]
         [1.0] * 4, [1.0] * 4, [1 / 12] * 4, [[0.5, 0.0]] * 4, [1e-3] * 4), 1e4, 0.1)
     start = make_state(np.tile([0.15, change_point - 0.15], 2), np.tile([-0.15, 0.15], 2))
@@ -364,7 +365,7 @@ def test_soft_rhombus_passes_change_points_as_a_parallelogram(change_point: floa
 
 @pytest.mark.parametrize(('stiffness', 'damping'), [(1e5, 0.0), (1e5, 50.0), (1e3, 500.0)])
 def test_long_steps_at_stiff_joints_stay_stable(stiffness: float, damping: float) -> None:
-    """Links of 0.3 m and 0.6 kg, at rest but for joints open by 1 mm, ten seconds at 5 ms."""
+    """Links of 0.3 m and 0.6 kg start at rest with gaps of 1 mm; ten seconds at 5 ms."""
     linkage = Mechanism(  # type: ignore[arg-type]
         [0.3] * 4, [0.6] * 4, [6e-3] * 4, [[0.15, 0.0]] * 4, [1.2e-4] * 4,
         joint_stiffness=[stiffness] * 4, joint_damping=[damping] * 4)
@@ -372,16 +373,16 @@ def test_long_steps_at_stiff_joints_stay_stable(stiffness: float, damping: float
     start[JOINT_GAPS] = [1e-3, 0.0, 0.0, 1e-3, -1e-3, 1e-3]
     states = held(linkage, start, 5e-3, 2000)
     energies = np.array([mechanical_energy(linkage, state) for state in states])
-    # Explicit methods that are stable take a little energy from every swing.
+    # Stable explicit methods damp every oscillation slightly.
     assert np.diff(energies).max() <= 1e-12 * energies[0]
     assert energies[-1] < energies[0]
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_step_is_divided_as_the_joints_need(
+def test_long_step_is_divided_according_to_the_joints(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """One long step is the same as that many short ones."""
+    """One long step equals the same number of short ones."""
     rng = np.random.default_rng(seed)
     linkage = with_uneven_joints(rng, random_linkage(rng))
     start = opened(rng, random_state(rng, linkage))
@@ -391,17 +392,17 @@ def test_step_is_divided_as_the_joints_need(
     once, many = start.copy(), start.copy()
     move_held(once, torques, step, 1, linkage.constants, NOTHING)
     move_held(many, torques, step / parts, parts, linkage.constants, NOTHING)
-    # Between the short ones the state is rounded once more; speeds reach 10 rad/s or so. The
-    # last entries hold what rounding left.
+    # The state is rounded between short steps; speeds reach about 10 rad/s. The last entries
+    # are the compensation of rounding errors.
     np.testing.assert_allclose(
         once[:CENTRE_COMPENSATION.start], many[:CENTRE_COMPENSATION.start], rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_state_is_the_same_after_the_way_to_the_bodies_and_back(
+def test_state_is_unchanged_after_conversion_to_bodies_and_back(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """A step of no time, of joints that are open and a mass centre anywhere."""
+    """The test uses a step of zero time with open joints and any mass centre."""
     rng = np.random.default_rng(seed)
     linkage = with_uneven_joints(rng, random_linkage(rng))
     start = opened(rng, random_state(rng, linkage))

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Conditioning over configurations: beside Kane's method, singular values, and by hand."""
+"""Conditioning over configurations against Kane's method, singular values, and by hand."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -18,18 +18,18 @@ import pytest
 Array = NDArray[np.float64]
 Draw = Callable[[np.random.Generator], Mechanism]
 SEEDS = range(12)
-# Not at 0, where branches have no names.
+# Configurations without 0, where branches have no names [rad].
 THETAS = np.linspace(-3.0, 3.0, 24)
 
 
 def closure_jacobian(mechanism: Mechanism, angles: Array) -> Array:
-    """Return J (2, 4): how fast the loop opens, in x and y, per rate of each link."""
+    """Return the closure Jacobian J (2, 4)."""
     signed = np.array(SIGNS) * mechanism.link_lengths
     return np.array([-signed * np.sin(angles), signed * np.cos(angles)])
 
 
 def configurations(linkage: Mechanism, branch: str) -> dict[int, Array]:
-    """Assemble the linkage wherever it closes: link angles by index of theta."""
+    """Return link angles by index of theta, where the linkage closes."""
     found = {}
     for index, theta in enumerate(THETAS):
         try:
@@ -41,10 +41,10 @@ def configurations(linkage: Mechanism, branch: str) -> dict[int, Array]:
 
 @pytest.mark.parametrize('branch', BRANCHES)
 @pytest.mark.parametrize('seed', SEEDS)
-def test_any_linkage_beside_singular_values(
+def test_any_linkage_against_singular_values(
     seed: int, branch: str, random_linkage: Draw,
 ) -> None:
-    """Null space of J by SVD, four-angle mass matrix; blank just where the loop cannot close."""
+    """The reference is the SVD of J and the mass matrix; values are NaN where it cannot close."""
     linkage = random_linkage(np.random.default_rng(seed))
     found = conditioning_grid([linkage], THETAS, branch)
     closed = configurations(linkage, branch)
@@ -54,30 +54,30 @@ def test_any_linkage_beside_singular_values(
         _, singular, rows = np.linalg.svd(closure_jacobian(linkage, angles))
         basis = rows[2:].T
         inertia = mass_matrix(angles, linkage.constants)
-        # The motions of unit rates of a and b, which is the basis of paper eq. 6.
+        # Motions of unit rates of a and b, the basis of paper eq. 6.
         of_axes = basis @ np.linalg.inv(basis[:2])
-        said = f'seed {seed}, theta {THETAS[index]}'
-        assert found.closure_ratio[0, index] == pytest.approx(singular[1] / singular[0]), said
-        assert found.alignment[0, index] == pytest.approx(abs(np.sin(angles[3] - angles[2]))), said
+        case = f'seed {seed}, theta {THETAS[index]}'
+        assert found.closure_ratio[0, index] == pytest.approx(singular[1] / singular[0]), case
+        assert found.alignment[0, index] == pytest.approx(abs(np.sin(angles[3] - angles[2]))), case
         assert found.condition_of_motions[0, index] == pytest.approx(
-            np.linalg.cond(basis.T @ inertia @ basis)), said
+            np.linalg.cond(basis.T @ inertia @ basis)), case
         assert found.condition[0, index] == pytest.approx(
-            np.linalg.cond(of_axes.T @ inertia @ of_axes), rel=1e-7), said
+            np.linalg.cond(of_axes.T @ inertia @ of_axes), rel=1e-7), case
         for left, gain in zip(WHEELS, found.gains[0, index], strict=True):
             wanted = np.linalg.svd(basis.T * (roots * left), compute_uv=False)[1]
-            assert gain == pytest.approx(wanted, abs=1e-9), (said, left)
+            assert gain == pytest.approx(wanted, abs=1e-9), (case, left)
 
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_condition_is_that_of_kanes_method(seed: int, random_linkage: Draw) -> None:
-    """The mass matrix that SymPy derives along the chain, translation and c, d eliminated."""
+    """The reference is the mass matrix by SymPy, with translation and c, d eliminated."""
     pytest.importorskip('sympy')
     from fourbar_ros.studies.independent import kane
 
     linkage = random_linkage(np.random.default_rng(seed))
     closed = configurations(linkage, 'open')
     index = list(closed)[len(closed) // 2]
-    # Wheels that are held on links without inertia of their own leave the links'.
+    # Locked wheels without inertia leave the inertia of the links.
     parameters = [*kane.parameters_of(linkage)[:20], *(0.0,) * 4]
     matrix = np.array(kane.derive_equations((True,) * 4).evaluate(
         closed[index], np.zeros(4), np.zeros(4), parameters)[0])
@@ -93,14 +93,13 @@ def test_motions_do_not_depend_on_which_links_are_the_axes(
     seed: int, random_linkage: Draw,
 ) -> None:
     """
-    The mirror image has a and b, c and d in each other's place.
+    The mirror image exchanges a with b and c with d.
 
-    Its cond(A) is the same, too. With the axes c and d, the loop turned around, only that of the
-    motions is.
+    Its cond(A) is the same. With the axes c and d, only the condition of the motions is the same.
     """
     linkage = random_linkage(np.random.default_rng(seed))
     order = [2, 3, 0, 1]
-    # Links c and d from joint 3 on: their frames begin at the other end.
+    # The frames of links c and d begin at joint 3.
     around = Mechanism(
         linkage.link_lengths[order], linkage.link_masses[order], linkage.link_inertias[order],
         np.column_stack([linkage.link_lengths - linkage.com_positions[:, 0],
@@ -127,7 +126,7 @@ def test_rhombus_by_hand() -> None:
     thetas = np.array([1e-5, 1e-3, 0.3, 1.0, np.pi / 2.0, 2.0, 3.0])
     found = conditioning_grid([load_mechanism('paper')], thetas)
     half = np.tan(0.5 * thetas)
-    # The rounding of an angle counts for one over theta, and another in phi_c.
+    # Rounding of angles is amplified by 1 / theta.
     np.testing.assert_allclose(found.closure_ratio[0], np.minimum(half, 1.0 / half), rtol=1e-6)
     np.testing.assert_allclose(found.alignment[0], np.sin(thetas), rtol=1e-6)
     np.testing.assert_allclose(found.condition_of_motions, 1.0, rtol=1e-6)
@@ -138,19 +137,19 @@ def test_rhombus_by_hand() -> None:
         np.testing.assert_allclose(found.gains[0, :, row], np.sqrt(0.5 * min(pairs)), atol=1e-6)
 
 
-def test_change_point_itself_is_blank() -> None:
+def test_change_point_is_nan() -> None:
     found = conditioning_grid([load_mechanism('paper')], [0.0])
     assert np.isnan(found.condition).all()
     assert np.isnan(found.gains).all()
 
 
 def test_small_singular_values_keep_their_digits() -> None:
-    """A basis of the motions next to a change point, where J J^T is singular to rounding."""
+    """The basis of the motions is exact next to a change point, where J J^T is singular."""
     for theta in (1e-5, 1e-8, 1e-11):
         x = (-1.0, np.cos(theta), 1.0, -np.cos(theta))
         y = (0.0, np.sin(theta), 0.0, -np.sin(theta))
         first, second, determinant = motions(x, y)
-        # Of a and c together, b and d together, in any mixture.
+        # Links a and c move together, and b and d.
         np.testing.assert_allclose((first[2:], second[2:]), (first[:2], second[:2]), atol=1e-12)
         np.testing.assert_allclose([first @ first, first @ second, second @ second],
                                    [1.0, 0.0, 1.0], atol=1e-12)

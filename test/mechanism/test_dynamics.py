@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The reduced equations against facts derived by hand and against an independent derivation."""
+"""The reduced equations against values by hand and against an independent derivation."""
 
 from collections.abc import Callable
 from typing import Any
@@ -36,7 +36,7 @@ ANGLES = (0.05, 0.3, 1.0, np.pi / 2, 2.0, 3.0, -0.8)
 
 
 def parallelogram(length_a: float, length_b: float, offsets: Any = (0.0,) * 4) -> Mechanism:
-    """Make the paper's links in other lengths: mass centre in the middle, or offset from it."""
+    """Make the links of the paper with other lengths and offsets of the mass centres."""
     lengths = np.array([length_a, length_b, length_a, length_b])
     return Mechanism(
         lengths, [0.02] * 4, [2.2e-5] * 4, np.column_stack([0.5 * lengths, offsets]),
@@ -44,13 +44,13 @@ def parallelogram(length_a: float, length_b: float, offsets: Any = (0.0,) * 4) -
 
 
 def condition(linkage: Mechanism, theta: float) -> float:
-    """Return the condition number of A where a and c, b and d are parallel."""
+    """Return the condition number of A of a parallelogram."""
     angles = [0.0, theta, 0.0, theta]
     return float(np.linalg.cond(reduced_form(linkage, angles, [0.0, 0.0]).mass_matrix))
 
 
 def accelerations(linkage: Mechanism, state: Array, torques: Array) -> Array:
-    """Return the accelerations of the links under motor torques, whichever way is taken."""
+    """Return the accelerations of the links under motor torques by the default form."""
     out = np.empty_like(state)
     evaluate(state, torques, linkage.constants, NOTHING, out)
     return out[LINK_RATES]
@@ -73,11 +73,11 @@ def by_constrained_form(linkage: Mechanism, state: Array, torques: Array) -> Arr
         motion, torques, System(linkage.constants, NOTHING), True).accelerations)
 
 
-# --- Facts ------------------------------------------------------------------------------------
+# --- Values by hand ---------------------------------------------------------------------------
 
 @pytest.mark.parametrize('theta', ANGLES)
 def test_mass_matrix_of_the_paper_is_the_same_in_every_configuration(theta: float) -> None:
-    """Identical uniform links: A = (2 I + m l^2 / 2) times the unit matrix."""
+    """For identical uniform links A = (2 I + m l^2 / 2) times the unit matrix."""
     form = reduced_form(load_mechanism('paper'), [0.0, theta, 0.0, theta], [0.3, -0.2])
     np.testing.assert_allclose(form.mass_matrix, 1.44e-4 * np.eye(2), rtol=0.0, atol=1e-15)
 
@@ -88,7 +88,7 @@ def test_mass_matrix_of_the_paper_is_the_same_in_every_configuration(theta: floa
 def test_conditioning_against_the_ratio_of_lengths(
     theta: float, ratio: float, expected: float,
 ) -> None:
-    """As in paper fig. 6a, and whatever the configuration."""
+    """The values are those of paper fig. 6a in any configuration."""
     assert condition(parallelogram(0.1 * ratio, 0.1), theta) == pytest.approx(expected, abs=5e-5)
 
 
@@ -99,9 +99,9 @@ def test_conditioning_against_the_same_offset_in_every_body_frame(
     theta: float, offset: float, expected: float, sign: float,
 ) -> None:
     """
-    Every com_positions has y = offset, one side of each link's own x axis.
+    All mass centres have y = offset in the frames of their links.
 
-    Seen from the loop that is towards the inside for a and d, away from it for b and c.
+    The offset is towards the inside of the loop for a and d, and to the outside for b and c.
     """
     linkage = parallelogram(0.1, 0.1, [sign * offset] * 4)
     assert condition(linkage, theta) == pytest.approx(expected, abs=5e-5)
@@ -113,7 +113,7 @@ def test_conditioning_against_the_same_offset_in_every_body_frame(
 def test_conditioning_against_the_offset_towards_the_inside(
     theta: float, offset: float, expected: float, sign: float,
 ) -> None:
-    """With y = +, -, -, + (a, b, c, d) all four lie inside the loop for 0 < theta < pi."""
+    """With the signs +, -, -, + (a, b, c, d) all are inside the loop for 0 < theta < pi."""
     linkage = parallelogram(0.1, 0.1, sign * offset * np.array([1.0, -1.0, -1.0, 1.0]))
     assert condition(linkage, theta) == pytest.approx(expected, abs=5e-5)
 
@@ -121,10 +121,10 @@ def test_conditioning_against_the_offset_towards_the_inside(
 @pytest.mark.parametrize('theta', ANGLES)
 @pytest.mark.parametrize('length_a', [0.05, 0.1, 0.3])
 def test_uniform_parallelogram_has_no_bias(length_a: float, theta: float) -> None:
-    """Its mass centre is that of the diagonals, so A is constant and the motion free of b."""
+    """The mass centre is the intersection of the diagonals, so A is constant and b is zero."""
     linkage = parallelogram(length_a, 0.1)
     bias = reduced_form(linkage, [0.4, 0.4 + theta, 0.4, 0.4 + theta], [1.0, -2.0]).bias
-    # Rounding of I omega^2, magnified by the fold: Gamma and sigma divide by sin(theta).
+    # Rounding of I omega^2 is amplified by 1 / sin(theta).
     scale = 4.0 * linkage.constants.cosine.max()
     np.testing.assert_allclose(bias, 0.0, rtol=0.0, atol=1e-14 * scale / abs(np.sin(theta)))
 
@@ -151,15 +151,15 @@ def test_reduced_mass_matrix_is_symmetric_and_positive(
     state = random_state(rng, linkage)
     matrix = reduced_form(linkage, state[LINK_ANGLES], state[LINK_RATES]).mass_matrix
     assert matrix[0, 1] == matrix[1, 0]
-    # W^T M W with W^T W >= 1: not below the smallest inertia.
+    # The matrix is W^T M W with W^T W >= 1, so no eigenvalue is below the smallest inertia.
     assert np.linalg.eigvalsh(matrix)[0] > linkage.link_inertias.min() * (1.0 - 1e-12)
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_accelerations_keep_the_closure(
+def test_accelerations_meet_the_closure(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """The second derivative of the gap, sum of s l (E e alpha - e omega^2), vanishes."""
+    """The second derivative of the gap, sum of s l (E e alpha - e omega^2), is zero."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     state = random_state(rng, linkage)
@@ -176,17 +176,17 @@ def test_reduced_form_is_refused_at_a_change_point(angles: list[float]) -> None:
         reduced_form(load_mechanism('paper'), angles, [0.1, 0.2])
 
 
-def test_wheel_map_takes_link_torques_to_the_axes() -> None:
-    """Paper eq. 6, columns a, b, c, d: in a parallelogram c works as a, and d as b."""
+def test_wheel_map_of_a_parallelogram() -> None:
+    """In paper eq. 6 the columns of c and d equal those of a and b in a parallelogram."""
     form = reduced_form(load_mechanism('paper'), [0.0, 1.0, 0.0, 1.0], [0.0, 0.0])
     np.testing.assert_allclose(
         form.wheel_map, [[1, 0, 1, 0], [0, 1, 0, 1]], rtol=0.0, atol=1e-15)
 
 
-# --- The two ways to solve them ---------------------------------------------------------------
+# --- Reduced and constrained form -------------------------------------------------------------
 
-# With units of order one, each result carries a few hundred roundings of numbers of order one;
-# the reduced form divides by the fold twice.
+# In units of order one, the error is a few hundred roundings; the reduced form divides twice by
+# the fold.
 @pytest.mark.parametrize('fold', [0.3, 0.05])
 @pytest.mark.parametrize('seed', SEEDS)
 def test_reduced_and_constrained_solutions_agree(
@@ -242,7 +242,7 @@ def test_reduced_form_agrees_with_an_independent_model(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
     kane_accelerations: Callable[..., Array],
 ) -> None:
-    """A du + b = -G tau with the accelerations of the other model."""
+    """The accelerations of the independent model meet A du + b = -G tau."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     state = random_state(rng, linkage)
@@ -281,11 +281,11 @@ def test_momentum_is_the_sum_over_the_bodies(
     assert ours == pytest.approx(expected, rel=1e-13, abs=1e-13)
 
 
-# --- Rates of what is conserved ---------------------------------------------------------------
+# --- Rates of conserved quantities ------------------------------------------------------------
 
 def rate_of(quantity: Callable[..., float], linkage: Mechanism, state: Array, torques: Array
             ) -> float:
-    """Differentiate along the motion, central differences of sixth order."""
+    """Differentiate along the motion by central differences of sixth order."""
     slope = np.empty_like(state)
     evaluate(state, torques, linkage.constants, NOTHING, slope)
     step = 2e-3 / max(1.0, np.abs(slope[LINK_RATES]).max())
@@ -298,9 +298,9 @@ def rate_of(quantity: Callable[..., float], linkage: Mechanism, state: Array, to
     return rate / (60.0 * step)
 
 
-# Differences over 2e-3 of values of about 10 J or kg m^2/s, each rounded to 1e-15 of it; the
-# formula's own error is about (2e-3)^6. With accelerations up to 100 rad/s^2 in the random
-# states the step shrinks as much as the rates grow.
+# Values of about 10 J or kg m^2/s have a relative rounding error of 1e-15, and differences are
+# over 2e-3. The error of the formula is about (2e-3)^6; the step is inverse to the rates, since
+# accelerations of the random states reach 100 rad/s^2.
 ROUNDING_OF_RATES = 1e-15 * 45.0 / 60.0 / 2e-3
 
 
@@ -308,7 +308,7 @@ ROUNDING_OF_RATES = 1e-15 * 45.0 / 60.0 / 2e-3
 def test_energy_changes_by_the_power_of_the_motors(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """A motor feels its wheel's speed relative to the link."""
+    """The power of a motor is torque times wheel speed relative to the link."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     state = random_state(rng, linkage)
@@ -340,7 +340,7 @@ def test_momentum_does_not_change_under_motor_torques(
 def test_opposite_torques_on_opposite_wheels_only_load_the_joints(
     seed: int, random_parallelogram: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """The third special case of paper section 3, away from the change points."""
+    """This is the third special case of paper section 3, away from change points."""
     rng = np.random.default_rng(seed)
     linkage = random_parallelogram(rng)
     theta = rng.uniform(0.3, np.pi - 0.3)

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What acts besides the motors: closed forms, balances, and an independent derivation."""
+"""Forces of the surroundings: closed forms, balances, and an independent derivation."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -46,21 +46,21 @@ JOINTS = [(0, 1), (1, 2), (2, 3), (3, 0)]
 
 def moved(linkage: Mechanism, start: Array, around: Surroundings, steps: int = 500,
           step: float = STEP) -> Array:
-    """Return the states (steps + 1, STATE_SIZE) of a motion without motors."""
+    """Return the states (steps + 1, STATE_SIZE) of a motion without motor torques."""
     return move_with_cosines(
         start, step * np.arange(steps + 1), NONE, NONE, NONE, 1.5 * step, linkage.constants,
         around)
 
 
 def travelling(rng: np.random.Generator, state: Array) -> Array:
-    """Put the mass centre somewhere, and let it move."""
+    """Return a state with a random position and velocity of the mass centre."""
     state = state.copy()
     state[CENTRE_POSITION], state[CENTRE_VELOCITY] = rng.uniform(-1.0, 1.0, (2, 2))
     return state
 
 
 def everything(rng: np.random.Generator) -> dict[str, Any]:
-    """Draw all effects at once, no two joints or links alike."""
+    """Draw all effects, with unequal values of joints and links."""
     return {
         'joint_coulomb': rng.uniform(0.0, 0.1, 4), 'joint_viscous': rng.uniform(0.0, 0.1, 4),
         'smoothing': 0.1, 'link_drag': rng.uniform(0.0, 0.5, 4),
@@ -70,22 +70,22 @@ def everything(rng: np.random.Generator) -> dict[str, Any]:
 
 # --- Closed forms -----------------------------------------------------------------------------
 
-# The paper's links in a parallelogram: A = 1.44e-4 kg m^2 for a and c together, and for b and d
-# together, in every configuration, and no bias. Each of the four joints is between the two pairs.
+# The links of the paper in a parallelogram have A = 1.44e-4 kg m^2 for each pair in every
+# configuration, and no bias. Each of the four joints is between the two pairs.
 A = 1.44e-4
 
 
 def two_pairs(rate_a: float, rate_b: float) -> Array:
-    """Place the paper's linkage far from change points."""
+    """Return a state of the linkage of the paper far from change points."""
     return make_state([0.3, 1.5, 0.3, 1.5], np.tile([rate_a, rate_b], 2))
 
 
 def test_viscous_joints_stop_the_configuration_exponentially(paper: Mechanism) -> None:
-    """Four joints take 4 c d(theta)/dt from one pair, and give it to the other."""
+    """The torque of four joints between the pairs is 4 c d(theta)/dt."""
     friction = 3e-6
     states = moved(paper, two_pairs(0.6, -0.2), surroundings(joint_viscous=friction))
     rate = np.exp(-8.0 * friction / A * STEP * np.arange(501))
-    # Order four: (8 c / A h)^4 / 120, with 1.7e-4 rad per step.
+    # The error is (8 c / A h)^4 / 120 with 1.7e-4 per step.
     np.testing.assert_allclose(states[:, 5] - states[:, 4], -0.8 * rate, rtol=0.0, atol=1e-13)
     np.testing.assert_allclose(states[:, 5] + states[:, 4], 0.4, rtol=0.0, atol=1e-13)
 
@@ -96,14 +96,14 @@ def test_coulomb_joints_stop_the_configuration_linearly(paper: Mechanism) -> Non
     around = surroundings(joint_coulomb=friction, smoothing=1e-6)
     states = moved(paper, two_pairs(0.6, -0.2), around)
     rate = 0.8 - 8.0 * friction / A * STEP * np.arange(501)
-    # Smoothing takes (1e-6 / 0.7)^2 / 2 of it.
+    # Smoothing changes the friction by (1e-6 / 0.7)^2 / 2.
     np.testing.assert_allclose(states[:, 4] - states[:, 5], rate, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_coulomb_friction_holds_to_creep(paper: Mechanism, sign: float) -> None:
+def test_linkage_creeps_below_coulomb_friction(paper: Mechanism, sign: float) -> None:
     """
-    Half of the torque that would break it loose makes it creep, at the smoothing rate / root 3.
+    Half of the break-away torque causes creep at the smoothing rate / sqrt(3).
 
     With torques -T, T, -T, T on the links each joint carries T / 2 against its friction T.
     """
@@ -111,17 +111,17 @@ def test_coulomb_friction_holds_to_creep(paper: Mechanism, sign: float) -> None:
     around = surroundings(joint_coulomb=torque, smoothing=smoothing,
                           link_torques=sign * torque * np.array([-1.0, 1.0, -1.0, 1.0]))
     end = moved(paper, two_pairs(0.0, 0.0), around, 300)[-1]
-    # By then exp(-(3/4)^1.5 8 T / (A smoothing) t) is left: 1e-93.
+    # The transient is exp(-(3/4)^1.5 8 T / (A smoothing) t) = 1e-93.
     assert end[5] - end[4] == pytest.approx(sign * smoothing / np.sqrt(3.0), rel=1e-9)
 
 
-def test_friction_leaves_a_linkage_at_rest_alone(paper: Mechanism) -> None:
+def test_friction_does_not_move_a_linkage_at_rest(paper: Mechanism) -> None:
     start = two_pairs(0.0, 0.0)
     around = surroundings(joint_coulomb=1e-3, joint_viscous=1e-3, link_drag=1.0,
                           link_spin_drag=1e-3)
     end = moved(paper, start, around, 10)[-1]
     np.testing.assert_array_equal(end[LINK_RATES], NONE)
-    # Links c and d are worked out anew from a and b.
+    # Links c and d are computed from a and b.
     np.testing.assert_allclose(end, start, rtol=0.0, atol=1e-15)
 
 
@@ -133,11 +133,11 @@ def test_spin_drag_stops_each_pair_exponentially(paper: Mechanism) -> None:
     np.testing.assert_allclose(states[:, 5], -0.2 * rate, rtol=0.0, atol=1e-13)
 
 
-def test_drag_on_mass_centres_slows_a_turn_by_their_distance(paper: Mechanism) -> None:
+def test_drag_on_mass_centres_slows_a_rotation(paper: Mechanism) -> None:
     """
-    Two links move at `rate l / 2` where the other pair turns, on either side.
+    When one pair turns, the two links of the other pair move at `rate l / 2`.
 
-    The pair itself turns about its mass centres, so that its drag is 2 (l / 2)^2 k.
+    The links of the turning pair do not translate, so the drag is 2 (l / 2)^2 k.
     """
     drag = 1e-2
     states = moved(paper, two_pairs(0.6, -0.2), surroundings(link_drag=drag))
@@ -166,14 +166,14 @@ def test_drag_in_proportion_to_mass_stops_the_mass_centre_exponentially(
 def test_tilted_table_takes_the_mass_centre_to_its_terminal_speed(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """Drag of `k` per mass bears the slope `g` at the speed g / k."""
+    """Drag of `k` per mass balances the slope `g` at the speed g / k."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     start = travelling(rng, random_state(rng, linkage, 0.7))
     slope, decay = rng.uniform(-1.0, 1.0, 2), 20.0
     around = surroundings(link_drag=decay * linkage.link_masses, gravity=slope)
     end = moved(linkage, start, around, 1500)[-1]
-    # exp(-20 1.5) of about 1 m/s is left.
+    # The transient is exp(-20 1.5) of about 1 m/s.
     np.testing.assert_allclose(end[CENTRE_VELOCITY], slope / decay, rtol=0.0, atol=2e-13)
 
 
@@ -181,7 +181,7 @@ def test_tilted_table_takes_the_mass_centre_to_its_terminal_speed(
 def test_mass_centre_falls_down_a_tilted_table(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """As g t^2 / 2, which is no approximation to a method of order four."""
+    """A method of order four integrates g t^2 / 2 exactly."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     start = travelling(rng, random_state(rng, linkage))
@@ -189,7 +189,7 @@ def test_mass_centre_falls_down_a_tilted_table(
     states = moved(linkage, start, surroundings(gravity=slope))
     time = STEP * np.arange(501)[:, np.newaxis]
     velocity, place = start[CENTRE_VELOCITY], start[CENTRE_POSITION]
-    # One rounding of 1 m or 1 m/s in each of 500 steps.
+    # Bound: 500 roundings of 1 m or 1 m/s.
     np.testing.assert_allclose(
         states[:, CENTRE_VELOCITY], velocity + slope * time, rtol=0.0, atol=5e-14)
     np.testing.assert_allclose(states[:, CENTRE_POSITION],
@@ -206,19 +206,19 @@ def test_tilted_table_does_not_change_the_motion_about_the_mass_centre(
     start = travelling(rng, random_state(rng, linkage, 0.7))
     tilted = moved(linkage, start, surroundings(gravity=[0.3, -0.4]))
     level = moved(linkage, start, NOTHING)
-    # Rounding of the forces, which should add up to nothing.
+    # The sum of the forces is zero within rounding.
     np.testing.assert_allclose(tilted[:, :8], level[:, :8], rtol=0.0, atol=1e-13)
 
 
 # --- Balances ---------------------------------------------------------------------------------
 
 def relative_rates(states: Array) -> Array:
-    """Return how fast joints 1 to 4 turn, (n, 4) [rad/s]."""
+    """Return the rates of joints 1 to 4 (n, 4) [rad/s]."""
     return np.stack([states[:, second] - states[:, first] for first, second in JOINTS], axis=1)
 
 
 def power_of(linkage: Mechanism, states: Array, effects: dict[str, Any]) -> Array:
-    """Evaluate what the effects give, (n,) [W], each from what it is said to be."""
+    """Return the power of the effects (n,) [W] from their definitions."""
     zero: Any = np.zeros(4)
     given = {**dict.fromkeys(
         ('joint_coulomb', 'joint_viscous', 'link_drag', 'link_spin_drag', 'link_torques'), zero),
@@ -241,7 +241,7 @@ def power_of(linkage: Mechanism, states: Array, effects: dict[str, Any]) -> Arra
 def test_energy_changes_by_the_work_of_the_effects(
     seed: int, effect: str, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """Their power, such as -c times rate squared in viscous joints, added up by Simpson's rule."""
+    """The power, such as -c times rate squared, is integrated by Simpson's rule."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     start = travelling(rng, random_state(rng, linkage, 0.7))
@@ -254,7 +254,7 @@ def test_energy_changes_by_the_work_of_the_effects(
     work = STEP / 3.0 * (
         power[0] + 4.0 * power[1::2].sum() + 2.0 * power[2:-1:2].sum() + power[-1])
     gained = mechanical_energy(linkage, states[-1]) - mechanical_energy(linkage, states[0])
-    # Links turn over at 10 rad/s at most: (w h)^4 / 180 of 1 W during 0.2 s.
+    # With rates of at most 10 rad/s the error is (w h)^4 / 180 of 1 W during 0.2 s.
     assert gained == pytest.approx(work, rel=0.0, abs=1e-11)
     assert abs(gained) > 1e-4
 
@@ -263,7 +263,7 @@ def test_energy_changes_by_the_work_of_the_effects(
 def test_friction_and_drag_never_give_energy(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """At no step, down to rest and through it."""
+    """The energy decreases at every step, also near rest."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     start = travelling(rng, random_state(rng, linkage, 0.7))
@@ -277,10 +277,10 @@ def test_friction_and_drag_never_give_energy(
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_joint_friction_keeps_momentum(
+def test_joint_friction_conserves_momentum(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """It acts between links, and the mass centre does not feel it at all."""
+    """Joint friction acts between links, so the mass centre does not accelerate."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     start = travelling(rng, random_state(rng, linkage))
@@ -297,7 +297,7 @@ def test_joint_friction_keeps_momentum(
 def test_outside_torques_give_their_impulse(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """Whatever joint friction does meanwhile."""
+    """Joint friction does not change the impulse."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     start = random_state(rng, linkage)
@@ -314,7 +314,7 @@ def test_outside_torques_give_their_impulse(
 def test_tilted_table_and_drag_change_momentum_about_the_origin_by_their_moment(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """Each force at its mass centre, added up over the motion by Simpson's rule."""
+    """The moments of the forces at the mass centres are integrated by Simpson's rule."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     start = travelling(rng, random_state(rng, linkage, 0.7))
@@ -331,7 +331,7 @@ def test_tilted_table_and_drag_change_momentum_about_the_origin_by_their_moment(
     assert gained == pytest.approx(impulse, rel=0.0, abs=1e-11)
 
 
-# --- Every way to solve them ------------------------------------------------------------------
+# --- Reduced, constrained and compliant form --------------------------------------------------
 
 @pytest.mark.parametrize('fold', [0.3, 0.05])
 @pytest.mark.parametrize('seed', SEEDS)
@@ -350,7 +350,7 @@ def test_reduced_and_constrained_solutions_agree(
         torques, system)
     constrained = constrained_accelerations(
         LinkMotion(a, *directions((a, b, c, d)), rates, velocity), torques, system, True)
-    # A few hundred roundings, and the reduced form divides by the fold twice.
+    # The error is a few hundred roundings; the reduced form divides twice by the fold.
     largest = max(1.0, np.abs(constrained.accelerations).max())
     np.testing.assert_allclose(
         [*reduced.accelerations, *reduced.centre, reduced.torque],
@@ -359,10 +359,10 @@ def test_reduced_and_constrained_solutions_agree(
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_stiff_joints_come_near_rigid_ones(
+def test_stiff_joints_approach_rigid_ones(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """With all effects: ten times the stiffness, a tenth of the difference in angle and place."""
+    """With all effects, differences in angle and position are inverse to the stiffness."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     start = travelling(rng, random_state(rng, linkage, 0.7))
@@ -376,7 +376,7 @@ def test_stiff_joints_come_near_rigid_ones(
         apart.append([np.abs(end[part] - rigid[part]).max()
                       for part in (LINK_ANGLES, CENTRE_POSITION)])
     decades = np.log10(np.array(apart[:-1]) / apart[1:])
-    # The next power of 1 / stiffness shows, most for the place, which differs by micrometres.
+    # The next power of 1 / stiffness contributes, most to the position, which differs by um.
     np.testing.assert_allclose(decades[:, 0], 1.0, rtol=0.0, atol=0.1)
     np.testing.assert_allclose(decades[:, 1], 1.0, rtol=0.0, atol=0.3)
 
@@ -388,7 +388,7 @@ def test_accelerations_agree_with_an_independent_model(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
     kane_accelerations_under_loads: Callable[..., Array],
 ) -> None:
-    """Under all effects at once, the links' and that of the mass centre."""
+    """Accelerations of links and mass centre agree under all effects."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     state = travelling(rng, random_state(rng, linkage))
@@ -404,7 +404,7 @@ def test_accelerations_agree_with_an_independent_model(
         rtol=0.0, atol=1e-11 * size)
 
 
-# --- What is refused --------------------------------------------------------------------------
+# --- Refused values ---------------------------------------------------------------------------
 
 @pytest.mark.parametrize(('name', 'size'), [
     ('joint_coulomb', 4), ('joint_viscous', 4), ('link_drag', 4), ('link_spin_drag', 4),
@@ -435,7 +435,7 @@ def test_friction_law_out_of_range_is_refused(
 
 
 def test_dry_friction_falls_from_static_to_coulomb() -> None:
-    """Static at rest, half of the surplus at the Stribeck rate, Coulomb far beyond."""
+    """Friction is static at rest, halfway at the Stribeck rate, and Coulomb far beyond."""
     for rate, expected in ((0.002, 1.5), (0.1, 1.25), (100.0, 1.0)):
         assert rate * dry_friction(rate, 1.5, 0.1, 1e-6) == pytest.approx(expected, rel=1e-3)
         assert dry_friction(-rate, 1.5, 0.1, 1e-6) == dry_friction(rate, 1.5, 0.1, 1e-6)
@@ -473,7 +473,7 @@ def test_friction_that_gives_energy_is_refused(name: str, refuses: Refuses) -> N
         surroundings(**values)
 
 
-def test_one_number_stands_for_all(paper: Mechanism) -> None:
+def test_one_number_applies_to_all(paper: Mechanism) -> None:
     start = two_pairs(0.6, -0.2)
     one, four = (surroundings(joint_viscous=value, link_torques=value, gravity=other)
                  for value, other in ((1e-6, 0.1), ([1e-6] * 4, [0.1, 0.1])))

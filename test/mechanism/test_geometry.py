@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Drawn joints are as far apart as the links are long, and the mass centre is the origin."""
+"""Positions of joints and mass centres in the frame of the whole."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,7 @@ ROUNDING = 1e-14
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_joints_are_a_link_apart(
+def test_distance_of_joints_is_the_link_length(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -56,7 +56,7 @@ def test_mass_centre_of_the_whole_is_the_origin(
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_mass_centre_sits_in_its_link_where_the_parameters_say(
+def test_mass_centre_in_its_link_is_that_of_the_parameters(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -71,7 +71,7 @@ def test_mass_centre_sits_in_its_link_where_the_parameters_say(
 
 
 @pytest.mark.parametrize('place', [joint_positions, com_positions_in_table])
-def test_many_poses_at_once_are_those_one_by_one(
+def test_array_of_poses_equals_single_poses(
     place: Callable[..., Array], random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
     rng = np.random.default_rng(0)

@@ -47,14 +47,14 @@ def momentum(linkage: Mechanism, state: Array) -> float:
 
 
 def momentum_scale(linkage: Mechanism, state: Array) -> float:
-    """Return the size of what adds up to the momentum, which itself may be near zero."""
+    """Return the sum of the sizes of the terms of the momentum, which may cancel."""
     matrix = np.abs(mass_matrix(state[LINK_ANGLES], linkage.constants))
     return float(matrix.sum(axis=0) @ np.abs(state[LINK_RATES])
                  + linkage.flywheel_inertias @ np.abs(state[WHEEL_SPEEDS]))
 
 
 def energy_of_links(linkage: Mechanism, state: Array) -> float:
-    """Return the links' share: the wheels' is much larger, and constant without torque."""
+    """Return the energy of the links; that of the wheels is larger and constant."""
     return kinetic_energy(linkage, state[LINK_ANGLES], state[LINK_RATES], NONE)
 
 
@@ -70,7 +70,7 @@ def move_under_constant_torques(
 # --- Reference motions ------------------------------------------------------------------------
 
 def reference_and_ours(name: str) -> tuple[dict, Array]:
-    """Read a reference motion from a model in maximal coordinates, and repeat it at 1 ms."""
+    """Return a reference motion of a model in maximal coordinates, and ours at 1 ms."""
     case = json.loads((DATA / f'{name}.json').read_text())
     linkage = Mechanism.from_mapping(case['mechanism'], name)
     initial, torque = case['initial'], case['motor_torque']
@@ -97,14 +97,14 @@ def test_link_rates_follow_the_reference(name: str) -> None:
 
 @pytest.mark.parametrize('name', REFERENCES)
 def test_wheel_speeds_follow_the_reference(name: str) -> None:
-    """Written with ten decimals, and up to 150 rad/s."""
+    """The file has ten decimals and speeds up to 150 rad/s."""
     case, ours = reference_and_ours(name)
     np.testing.assert_allclose(
         ours[:, WHEEL_SPEEDS], case['flywheel_speeds_absolute'], rtol=1e-9, atol=1e-9)
 
 
 def test_wheel_angles_are_relative_to_the_links() -> None:
-    """Wheels that keep an absolute speed of zero turn back by what their links turn."""
+    """A wheel with zero absolute speed turns relative to its link by minus the link angle."""
     linkage = load_mechanism('paper')
     start = make_state([0.0, 1.0, 0.0, 1.0], [0.5, -0.25, 0.5, -0.25], NONE)
     states = move_under_constant_torques(linkage, start, NONE, 1e-3, 1000)
@@ -118,7 +118,7 @@ def test_wheel_angles_are_relative_to_the_links() -> None:
 def test_integration_is_of_order_four(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """Halving the step divides the error by 16, which leaves 15/16 of it as the difference."""
+    """Halving the step divides the error by 16."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     start = random_state(rng, linkage, 0.7)
@@ -129,16 +129,16 @@ def test_integration_is_of_order_four(
             NOTHING)[-1]
         for step in (0.01, 0.005, 0.0025)]
     first, second = (np.abs(coarse - fine)[:8].max() for coarse, fine in zip(ends, ends[1:]))
-    # The next order shows as a tenth or two at these steps, rounding not yet.
+    # The next order contributes one or two tenths at these steps; rounding is smaller.
     assert np.log2(first / second) == pytest.approx(4.0, abs=0.4)
 
 
 def truncation(states: Array, step: float) -> float:
     """
-    Estimate the relative error that a method of order four leaves, `10 w T (w h)^4`.
+    Estimate the relative error of a method of order four, `10 w T (w h)^4`.
 
-    The frequency w is that of the fastest change: the largest rate, or the root of the largest
-    acceleration where a fold makes the links turn over. The factor is for the number of terms.
+    The frequency w is the larger one of the largest rate and the square root of the largest
+    acceleration. The factor is for the number of terms.
     """
     rates = states[:, LINK_RATES]
     fastest = max(np.abs(rates).max(), np.sqrt(np.abs(np.diff(rates, axis=0)).max() / step))
@@ -147,7 +147,7 @@ def truncation(states: Array, step: float) -> float:
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_momentum_is_kept_in_free_motion(
+def test_momentum_is_conserved_in_free_motion(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
     move_freely: Callable[..., Array],
 ) -> None:
@@ -159,7 +159,7 @@ def test_momentum_is_kept_in_free_motion(
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_energy_is_kept_in_free_motion(
+def test_energy_is_conserved_in_free_motion(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
     move_freely: Callable[..., Array],
 ) -> None:
@@ -171,10 +171,10 @@ def test_energy_is_kept_in_free_motion(
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_motor_work_is_what_the_energy_gains(
+def test_motor_work_is_the_gain_of_energy(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """The work of a constant torque is torque times turn of the wheel relative to its link."""
+    """The work of a constant torque is torque times relative angle of the wheel."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     torques = rng.uniform(-0.1, 0.1, 4)
@@ -203,7 +203,7 @@ def test_loop_stays_closed(
 def test_opposite_torques_do_not_move_a_parallelogram(
     seed: int, random_parallelogram: Draw, move_freely: Callable[..., Array],
 ) -> None:
-    """Away from the change points they only load the joints."""
+    """Away from the change points opposite torques only load the joints."""
     rng = np.random.default_rng(seed)
     linkage = random_parallelogram(rng)
     theta, rates = rng.uniform(0.8, 2.3), rng.uniform(-0.5, 0.5, 2)
@@ -212,14 +212,14 @@ def test_opposite_torques_do_not_move_a_parallelogram(
     loaded = move_under_constant_torques(
         linkage, start, np.array([first, second, -first, -second]), 1e-3, 500)
     free = move_freely(linkage, start, 1e-3, 500)
-    # Rounding of tau / I (1 N m over at least 0.006 kg m^2), added up over half a second.
+    # Bound: rounding of tau / I (1 N m over at least 0.006 kg m^2), integrated over half a second.
     np.testing.assert_allclose(loaded[:, :8], free[:, :8], rtol=0.0, atol=1e-12)
 
 
 def test_a_million_steps_lose_no_momentum(
     random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """1000 s of free motion, seed 3: linear and angular momentum to 1e-12, the loop closed."""
+    """In 1000 s of free motion (seed 3) the momenta change by less than 1e-12."""
     rng = np.random.default_rng(3)
     linkage = random_linkage(rng)
     state = random_state(rng, linkage)

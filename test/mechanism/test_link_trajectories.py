@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Motions side by side are those that each makes alone."""
+"""Trajectories of several motions equal those of single motions."""
 
 from fourbar_ros.mechanism import assemble, Mechanism
 from fourbar_ros.mechanism.forces import NOTHING, surroundings
@@ -12,8 +12,8 @@ import numpy as np
 STEP, STEPS = 1e-3, 4
 
 
-def test_each_motion_is_bit_for_bit_that_of_its_own(paper: Mechanism, uneven: Mechanism) -> None:
-    """Other linkages, surroundings, torques, factors and starts; seed 0."""
+def test_each_motion_has_the_bits_of_a_single_motion(paper: Mechanism, uneven: Mechanism) -> None:
+    """The motions differ in linkages, surroundings, torques, factors and starts; seed 0."""
     generator = np.random.default_rng(0)
     mechanisms = [paper, uneven, paper]
     around = [NOTHING, surroundings(link_spin_drag=1e-6), surroundings(link_drag=1e-2)]

@@ -25,7 +25,7 @@ REQUIRED = FINITE
 
 
 def described(**changes: Any) -> dict[str, Any]:
-    """Describe a sound linkage, some of its keys changed."""
+    """Return the description of a valid linkage with some changed keys."""
     values: dict[str, Any] = {
         'link_lengths': [0.12, 0.1, 0.11, 0.09],
         'link_masses': [0.02, 0.03, 0.025, 0.015],
@@ -39,13 +39,13 @@ def described(**changes: Any) -> dict[str, Any]:
 
 
 def with_one(name: str, link: int, value: float) -> dict[str, Any]:
-    """Describe a sound linkage, but for one number."""
+    """Return the description of a valid linkage with one changed number."""
     array = np.array(described()[name], dtype=float)
     array[link, ...] = value
     return described(**{name: array})
 
 
-def test_sound_mechanism_keeps_every_value() -> None:
+def test_valid_mechanism_has_every_value() -> None:
     mechanism = Mechanism(**described())
     for name, value in described().items():
         np.testing.assert_array_equal(getattr(mechanism, name), value, err_msg=name)
@@ -134,7 +134,7 @@ def test_offset_of_a_sensor_may_be_negative_but_must_be_known(refuses: Refuses) 
 def test_lengths_that_cannot_close_are_refused(
     link: int, excess: float, refuses: Refuses,
 ) -> None:
-    lengths = np.full(4, 0.125)     # a power of two, so that three of them add up exactly
+    lengths = np.full(4, 0.125)     # a power of two, so that the sum of three is exact
     lengths[link] = 0.375 + excess
     with refuses(MechanismError, name=f'link_lengths.{LINK_NAMES[link]}',
                  value=float(lengths[link]), limit=0.375):
@@ -212,23 +212,23 @@ def test_refusal_of_a_file_names_the_file(tmp_path: Path, refuses: Refuses) -> N
 
 
 def test_constants_have_the_symmetry_of_a_mass_matrix() -> None:
-    """M_jk = M_kj for all angles needs a symmetric cosine part and an antisymmetric sine part."""
+    """By M_jk = M_kj the cosine part is symmetric and the sine part antisymmetric."""
     constants = Mechanism(**described()).constants
     # Rounding of products of order 1e-4 kg m^2.
     np.testing.assert_allclose(constants.cosine, constants.cosine.T, rtol=0.0, atol=1e-18)
     np.testing.assert_allclose(constants.sine, -constants.sine.T, rtol=0.0, atol=1e-18)
 
 
-def test_constants_do_not_depend_on_where_a_whole_mass_sits_alone() -> None:
-    """With all mass in one link nothing but the four inertias is left about the mass centre."""
+def test_constants_of_a_single_mass_do_not_depend_on_its_position() -> None:
+    """With all mass in one link only the four inertias remain about the mass centre."""
     masses = np.array([1.0, 1e-18, 1e-18, 1e-18])
     constants = Mechanism(**described(link_masses=masses)).constants
-    # What is left of the light links: 1e-18 kg at 0.1 m.
+    # The other links have 1e-18 kg at 0.1 m.
     np.testing.assert_allclose(
         constants.cosine, np.diag(described()['link_inertias']), rtol=0.0, atol=1e-18)
 
 
-def test_constants_are_worked_out_once() -> None:
+def test_constants_are_computed_once() -> None:
     mechanism = Mechanism(**described())
     assert mechanism.constants is mechanism.constants
 
@@ -279,7 +279,7 @@ def test_value_that_needs_another_is_refused(
 
 
 @pytest.mark.parametrize('damping', [None, [0.0] * 4])
-def test_rigid_joints_may_be_written_too(damping: list[float] | None) -> None:
+def test_rigid_joints_may_be_given_explicitly(damping: list[float] | None) -> None:
     given = {} if damping is None else {'joint_damping': damping}
     assert not Mechanism(**described(joint_stiffness=[np.inf] * 4, **given)).constants.compliant
 
@@ -307,7 +307,7 @@ def test_joints_are_read_from_a_file_and_refused_with_it(
         load_mechanism(str(file))
 
 
-def test_rigid_joints_leave_everything_else() -> None:
+def test_rigid_joints_change_no_other_value() -> None:
     soft = Mechanism(**described(joint_stiffness=[1e4] * 4, joint_damping=[1.0] * 4))
     rigid = soft.with_rigid_joints()
     for name, value in described().items():
@@ -315,12 +315,12 @@ def test_rigid_joints_leave_everything_else() -> None:
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_no_joint_moves_faster_than_the_bound(seed: int) -> None:
+def test_bound_of_the_joint_modes(seed: int) -> None:
     """
-    The frequencies of four bodies on springs, and the decay rates of dampers alone.
+    The reference is frequencies of four bodies on springs and decay rates of dampers.
 
-    Linear motion about a loop that is nearly closed, from the forces that a unit displacement of
-    each coordinate makes in every joint; by numpy's eigenvalues.
+    They are eigenvalues of the linear motion about an almost closed loop, from the joint forces of
+    unit displacements of each coordinate.
     """
     rng = np.random.default_rng(seed)
     stiffness, damping = 10.0**rng.uniform(2.0, 6.0, 4), 10.0**rng.uniform(-2.0, 2.0, 4)
@@ -344,11 +344,11 @@ def test_no_joint_moves_faster_than_the_bound(seed: int) -> None:
         fastest.append(np.linalg.norm(scaled, 2)**2)
     bound = mechanism.constants.fastest_joint_mode
     assert max(np.sqrt(fastest[0]), fastest[1]) <= bound
-    # Gershgorin's discs of eight rows: at most that much too careful.
+    # The bound by Gershgorin's discs of eight rows is too large by at most eight.
     assert bound <= 8.0 * max(np.sqrt(fastest[0]), fastest[1])
 
 
-def test_joints_are_rigid_unless_told() -> None:
+def test_joints_are_rigid_by_default() -> None:
     rigid = Mechanism(**described())
     soft = Mechanism(**described(joint_stiffness=[1e4] * 4, joint_damping=[1.0] * 4))
     assert not rigid.constants.compliant
@@ -357,7 +357,7 @@ def test_joints_are_rigid_unless_told() -> None:
 
 
 def test_prescribed_wheels_turn_with_their_links() -> None:
-    """Their axial inertia counts as that of the link, the others' does not."""
+    """Only the axial inertia of prescribed wheels is added to that of the link."""
     mechanism = Mechanism(**described())
     given = np.array([True, False, False, True])
     added = np.diag(mechanism.constants_with(given).cosine - mechanism.constants.cosine)
@@ -366,10 +366,10 @@ def test_prescribed_wheels_turn_with_their_links() -> None:
 
 
 @pytest.mark.parametrize('signs', [(1, -1, -1, 1), (1, 1, -1, -1), (1, -1, 1, -1)])
-def test_lengths_that_almost_meet_a_change_point_are_made_to_meet_it(
+def test_lengths_with_a_mismatch_within_rounding_are_matched(
     signs: tuple[int, ...],
 ) -> None:
-    """Within 1e-8 of their mean; those that miss it by more keep their values."""
+    """Mismatches within 1e-8 of the mean length are removed; larger ones are kept."""
     lengths = np.array([0.12, 0.1, 0.14, 0.09])
     lengths -= np.dot(signs, lengths) / 4.0 * np.array(signs)
     one = np.array([0.0, 0.0, lengths.mean(), 0.0])

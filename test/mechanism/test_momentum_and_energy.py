@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Momentum, energy and joint gaps, body by body, against cases that can be worked out by hand."""
+"""Momentum, energy and joint gaps, body by body, against cases by hand."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -42,7 +42,7 @@ def cross(first: Array, second: Array) -> float:
 
 
 def with_open_joints(rng: np.random.Generator, linkage: Mechanism) -> tuple[Mechanism, Array]:
-    """Give a linkage springs, and draw a state that meets nothing: any angles, any gaps."""
+    """Return a compliant linkage and a state with random angles and gaps."""
     soft = replace(
         linkage, joint_stiffness=rng.uniform(10.0, 1e3, 4), joint_damping=rng.uniform(0, 9.0, 4))
     state = make_state(
@@ -53,24 +53,24 @@ def with_open_joints(rng: np.random.Generator, linkage: Mechanism) -> tuple[Mech
     return soft, state
 
 
-# --- Cases worked out by hand -----------------------------------------------------------------
+# --- Cases by hand ----------------------------------------------------------------------------
 
 @pytest.fixture
 def square() -> Mechanism:
-    """Make a square of 2 m, uniform links of 1 kg with all that differs told apart by size."""
+    """Make a square of 2 m of uniform links of 1 kg, whose other parameters differ in size."""
     return Mechanism(  # type: ignore[arg-type]
         [2.0] * 4, [1.0] * 4, [0.25] * 4, [[1.0, 0.0]] * 4, [0.5] * 4, joint_stiffness=[8.0] * 4)
 
 
 def squared(rates: ArrayLike = 0.0, wheels: ArrayLike = 0.0) -> Array:
-    """Place the square: a and c along x, b and d along y, its middle at the origin."""
+    """Return a state of the square with a and c along x, b and d along y, centred at 0."""
     state = make_state([0.0, np.pi / 2, 0.0, np.pi / 2])
     state[LINK_RATES], state[WHEEL_SPEEDS] = rates, wheels
     return state
 
 
 def test_bodies_of_a_square_lie_around_its_middle(square: Mechanism) -> None:
-    """Joint 1 is at (-1, -1): a below, d right, c above, b left."""
+    """With joint 1 at (-1, -1), a is below, d right, c above, b left."""
     place, speed = body_motion(square, squared())
     expected = [[0.0, -1.0], [-1.0, 0.0], [0.0, 1.0], [1.0, 0.0]]
     np.testing.assert_allclose(place, expected, rtol=0.0, atol=ROUNDING)
@@ -78,7 +78,7 @@ def test_bodies_of_a_square_lie_around_its_middle(square: Mechanism) -> None:
 
 
 def test_square_that_turns_is_one_rigid_body(square: Mechanism) -> None:
-    """Four bodies of 1 kg and 0.25 kg m^2, 1 m from the axis, and wheels that turn with them."""
+    """The square has four bodies of 1 kg and 0.25 kg m^2 at 1 m, and wheels that turn too."""
     inertia = 4 * (0.25 + 1.0 * 1.0**2 + 0.5)
     state = squared(3.0, 3.0)
     assert total_angular_momentum(square, state) == pytest.approx(inertia * 3.0, rel=ROUNDING)
@@ -87,7 +87,7 @@ def test_square_that_turns_is_one_rigid_body(square: Mechanism) -> None:
 
 
 def test_square_that_travels_has_the_momentum_of_its_mass(square: Mechanism) -> None:
-    """At (5, 7) m with (2, 3) m/s: 4 kg, of which the moment about the origin is 5 3 - 7 2."""
+    """The angular momentum of 4 kg at (5, 7) m with (2, 3) m/s is 4 (5 3 - 7 2)."""
     state = squared()
     state[CENTRE_POSITION], state[CENTRE_VELOCITY] = [5.0, 7.0], [2.0, 3.0]
     np.testing.assert_allclose(linear_momentum(square, state), [8.0, 12.0], rtol=ROUNDING)
@@ -106,7 +106,7 @@ def test_wheel_alone_adds_its_spin(square: Mechanism, wheel: int) -> None:
 def test_one_pair_of_links_turns_and_shears_the_square(
     square: Mechanism, pair: tuple[int, int],
 ) -> None:
-    """Both turn about their mass centres and carry the two others apart, 1 m/s per rad/s."""
+    """Both links turn about their mass centres and move the two others at 1 m/s per rad/s."""
     rates = np.zeros(4)
     rates[list(pair)] = 2.0
     state = squared(rates)
@@ -116,14 +116,14 @@ def test_one_pair_of_links_turns_and_shears_the_square(
 
 
 @pytest.mark.parametrize(('gaps', 'expected'), [
-    # Joint 1 open: the other links stay where they are to each other, so joint 3 opens too.
+    # With joint 1 open, joint 3 has the same gap, since the angles do not change.
     ([0.3, 0.4, 0.0, 0.0, 0.0, 0.0], [[0.3, 0.4], [0.0, 0.0], [0.3, 0.4], [0.0, 0.0]]),
     ([0.0, 0.0, 0.3, 0.4, 0.0, 0.0], [[0.0, 0.0], [0.3, 0.4], [0.3, 0.4], [0.0, 0.0]]),
     ([0.0, 0.0, 0.0, 0.0, 0.3, 0.4], [[0.0, 0.0], [0.0, 0.0], [-0.3, -0.4], [0.3, 0.4]])])
-def test_open_joint_leaves_joint_3_open(
+def test_open_joint_opens_joint_3(
     square: Mechanism, gaps: list[float], expected: list[list[float]],
 ) -> None:
-    """Each of the two springs is stretched by 0.5 m, at 8 N/m."""
+    """Two springs of 8 N/m are stretched by 0.5 m."""
     state = squared()
     state[JOINT_GAPS] = gaps
     np.testing.assert_allclose(joint_gaps(square, state), expected, rtol=0.0, atol=ROUNDING)
@@ -131,14 +131,14 @@ def test_open_joint_leaves_joint_3_open(
 
 
 def test_opening_joints_move_the_bodies(square: Mechanism) -> None:
-    """Joint 2 opens: c leaves, the others together go the other way with a third of its speed."""
+    """When joint 2 opens, c moves away and the others at a third of its speed opposite to it."""
     state = squared()
     state[JOINT_GAP_RATES] = [0.0, 0.0, 4.0, 0.0, 0.0, 0.0]
     speed = body_motion(square, state)[1]
     expected = [[-1.0, 0.0], [-1.0, 0.0], [3.0, 0.0], [-1.0, 0.0]]
     np.testing.assert_allclose(speed, expected, rtol=0.0, atol=ROUNDING)
     assert mechanical_energy(square, state) == pytest.approx(0.5 * (3 * 1.0 + 9.0), rel=ROUNDING)
-    # Around the middle: c goes at 3 m/s one metre above it, a at -1 m/s one metre below.
+    # About the middle, c has 3 m/s one metre above and a has -1 m/s one metre below.
     assert total_angular_momentum(square, state) == pytest.approx(-3.0 - 1.0, rel=ROUNDING)
 
 
@@ -148,7 +148,7 @@ def test_opening_joints_move_the_bodies(square: Mechanism) -> None:
 def test_rigid_linkage_has_the_momentum_of_its_link_angles(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """About the mass centre, which rests in the origin."""
+    """The momentum is about the mass centre, which rests in the origin."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     state = random_state(rng, linkage)
@@ -181,8 +181,8 @@ def test_rigid_joints_are_closed(
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_travel_adds_what_the_whole_mass_would_have(seed: int, random_linkage: Draw) -> None:
-    """Koenig: momentum and energy about the mass centre, and those of the mass centre."""
+def test_translation_adds_that_of_the_total_mass(seed: int, random_linkage: Draw) -> None:
+    """By Koenig's theorem they are the sum of those about and of the mass centre."""
     rng = np.random.default_rng(seed)
     linkage, travelling = with_open_joints(rng, random_linkage(rng))
     resting = travelling.copy()
@@ -199,7 +199,7 @@ def test_travel_adds_what_the_whole_mass_would_have(seed: int, random_linkage: D
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_gaps_are_those_of_the_state(seed: int, random_linkage: Draw) -> None:
-    """Of joints 1, 2 and 4; joint 3 is open by what the way around the loop leaves."""
+    """The state has the gaps of joints 1, 2 and 4; that of joint 3 follows from the loop."""
     rng = np.random.default_rng(seed)
     linkage, state = with_open_joints(rng, random_linkage(rng))
     gaps = joint_gaps(linkage, state)
@@ -212,8 +212,8 @@ def test_gaps_are_those_of_the_state(seed: int, random_linkage: Draw) -> None:
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_speeds_are_how_the_places_change(seed: int, random_linkage: Draw) -> None:
-    """Along any change of angles, gaps and mass centre, by central differences of order four."""
+def test_speeds_are_derivatives_of_the_positions(seed: int, random_linkage: Draw) -> None:
+    """The test uses central differences of order four along a random change of the state."""
     rng = np.random.default_rng(seed)
     linkage, state = with_open_joints(rng, random_linkage(rng))
     slope = np.zeros_like(state)
@@ -224,14 +224,14 @@ def test_speeds_are_how_the_places_change(seed: int, random_linkage: Draw) -> No
     near, far = (
         body_motion(linkage, state + k * step * slope)[0]
         - body_motion(linkage, state - k * step * slope)[0] for k in (1, 2))
-    # Rounding of 1e-15 m over 2e-3 s; the formula itself leaves 1e-3^4 / 30 of the fifth power
-    # of 1 rad/s.
+    # Rounding is 1e-15 m over 2e-3 s; the error of the formula is 1e-3^4 / 30 times the fifth
+    # power of 1 rad/s.
     np.testing.assert_allclose(
         (8.0 * near - far) / (12.0 * step), body_motion(linkage, state)[1], rtol=0.0, atol=2e-12)
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_energy_holds_what_stretched_the_springs(seed: int, random_linkage: Draw) -> None:
+def test_energy_contains_that_of_the_springs(seed: int, random_linkage: Draw) -> None:
     rng = np.random.default_rng(seed)
     linkage, state = with_open_joints(rng, random_linkage(rng))
     stretch = np.abs(joint_gaps(linkage, state) @ [1.0, 1j])

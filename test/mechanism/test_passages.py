@@ -1,6 +1,6 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The way past change points: ideal linkages pass, all others fold, as other engines find too."""
+"""Motion through change points: ideal linkages pass, others fold as in other engines."""
 
 from collections.abc import Callable
 
@@ -36,19 +36,19 @@ def momentum(linkage: Mechanism, state: Array) -> float:
 
 
 def momentum_scale(linkage: Mechanism, state: Array) -> float:
-    """Return the size of what adds up to the momentum, which itself may be near zero."""
+    """Return the sum of the sizes of the terms of the momentum, which may cancel."""
     matrix = np.abs(mass_matrix(state[LINK_ANGLES], linkage.constants))
     return float(matrix.sum(axis=0) @ np.abs(state[LINK_RATES])
                  + linkage.flywheel_inertias @ np.abs(state[WHEEL_SPEEDS]))
 
 
 def energy_of_links(linkage: Mechanism, state: Array) -> float:
-    """Return the links' share: the wheels' is much larger, and constant without torque."""
+    """Return the energy of the links; that of the wheels is larger and constant."""
     return kinetic_energy(linkage, state[LINK_ANGLES], state[LINK_RATES], NONE)
 
 
 def centripetal_bias(angles: Array, rates: Array, linkage: Mechanism) -> Array:
-    """Evaluate h (4,) [N m]: what the links' rates alone ask of each link angle."""
+    """Return the bias h (4,) [N m]."""
     difference = angles[None, :] - angles[:, None]
     constants = linkage.constants
     slope = constants.sine * np.cos(difference) - constants.cosine * np.sin(difference)
@@ -67,13 +67,13 @@ def move_under_constant_torques(
 
 CHANGE_POINTS = (0.0, np.pi)
 STEP = 5e-4
-# Within 1e-4 rad of the change point an angle's rounding of 4e-16 rad shows as 4e-12 of the
-# rates, once per step that ends there: at 0.01 rad/s some forty of them.
+# Within 1e-4 rad of the change point a rounding of 4e-16 rad changes the rates by 4e-12 of their
+# size, once per step that ends there: at 0.01 rad/s about forty times.
 ROUNDING = 1e-9
 
 
 def parallel_state(rng: np.random.Generator, theta: float, rates: Array) -> Array:
-    """Make a state of a parallelogram, wheels turning."""
+    """Make a state of a parallelogram with turning wheels."""
     phi_a = rng.uniform(-3.0, 3.0)
     return make_state(
         np.tile([phi_a, phi_a + theta], 2), np.tile(rates, 2), rng.uniform(-9.0, 9.0, 4))
@@ -84,10 +84,10 @@ def passage(
     torques: Array = NONE, before: float = 1.0,
 ) -> tuple[Mechanism, Array]:
     """
-    Move an ideal parallelogram of four different bodies past a change point.
+    Move an ideal parallelogram of four different bodies through a change point.
 
-    From theta 0.03 rad before it (times `before`: 0 starts on it), for about 0.06 rad, with theta
-    changing at 0.01 to 1 rad/s in either direction and the whole turning about as fast.
+    It starts 0.03 rad before the change point (times `before`), and theta changes by 0.06 rad at a
+    rate of 0.01 to 1 rad/s in either direction. The whole turns at a similar rate.
     """
     rng = np.random.default_rng(seed)
     linkage = random_parallelogram(rng)
@@ -101,9 +101,9 @@ def passage(
 
 def motion_of_two_angles(linkage: Mechanism, start: Array, torques: Array, time: float) -> Array:
     """
-    Return (phi_a, phi_b, omega_a, omega_b) of a parallelogram that cannot be anything else.
+    Return (phi_a, phi_b, omega_a, omega_b) of a linkage that is a parallelogram by constraint.
 
-    Its A and b, from c = a and d = b throughout, are regular at the change points.
+    Its A and b follow from c = a and d = b and are regular at the change points.
     """
     def slope(y: Array) -> Array:
         angles, rates = np.tile(y[:2], 2), np.tile(y[2:], 2)
@@ -112,7 +112,7 @@ def motion_of_two_angles(linkage: Mechanism, start: Array, torques: Array, time:
         pairs = matrix.reshape(2, 2, 2, 2).sum(axis=(0, 2))
         return np.concatenate([y[2:], np.linalg.solve(pairs, force.reshape(2, 2).sum(axis=0))])
 
-    # Steps of 3e-4 rad: an error of order four is below rounding.
+    # With steps of 3e-4 rad the truncation error is below rounding.
     y, steps = start[[0, 1, 4, 5]], 200
     step = time / steps
     for _ in range(steps):
@@ -125,7 +125,7 @@ def motion_of_two_angles(linkage: Mechanism, start: Array, torques: Array, time:
 
 
 def assert_moves_like_two_angles(linkage: Mechanism, states: Array, torques: Array) -> None:
-    """Compare the end of a motion with that of the parallelogram that has no change points."""
+    """Check the end of a motion against that of the parallelogram without change points."""
     expected = motion_of_two_angles(linkage, states[0], torques, STEP * (len(states) - 1))
     rate = np.abs(states[0, LINK_RATES]).max()
     end = states[-1]
@@ -147,7 +147,7 @@ def test_passage_crosses_the_change_point(
 
 @pytest.mark.parametrize('change_point', CHANGE_POINTS)
 @pytest.mark.parametrize('seed', SEEDS)
-def test_passage_keeps_opposite_links_parallel(
+def test_opposite_links_stay_parallel_during_a_passage(
     seed: int, change_point: float, random_parallelogram: Draw,
 ) -> None:
     _, states = passage(seed, change_point, random_parallelogram)
@@ -157,7 +157,7 @@ def test_passage_keeps_opposite_links_parallel(
 
 @pytest.mark.parametrize('change_point', CHANGE_POINTS)
 @pytest.mark.parametrize('seed', SEEDS)
-def test_passage_keeps_momentum(
+def test_passage_conserves_momentum(
     seed: int, change_point: float, random_parallelogram: Draw,
 ) -> None:
     linkage, states = passage(seed, change_point, random_parallelogram)
@@ -169,7 +169,7 @@ def test_passage_keeps_momentum(
 
 @pytest.mark.parametrize('change_point', CHANGE_POINTS)
 @pytest.mark.parametrize('seed', SEEDS)
-def test_passage_keeps_energy(
+def test_passage_conserves_energy(
     seed: int, change_point: float, random_parallelogram: Draw,
 ) -> None:
     linkage, states = passage(seed, change_point, random_parallelogram)
@@ -180,7 +180,7 @@ def test_passage_keeps_energy(
 @pytest.mark.parametrize('change_point', CHANGE_POINTS)
 @pytest.mark.parametrize('seed', SEEDS)
 def test_passage_has_no_jump(seed: int, change_point: float, random_parallelogram: Draw) -> None:
-    """Within one step nothing moves faster than at the fastest end of the passage, nearly."""
+    """Changes within one step are at most those of the fastest rate, nearly."""
     _, states = passage(seed, change_point, random_parallelogram)
     fastest = 1.5 * np.abs(states[[0, -1], LINK_RATES]).max()
     assert np.abs(np.diff(states[:, LINK_ANGLES], axis=0)).max() < STEP * fastest
@@ -218,10 +218,10 @@ def test_moving_linkage_passes_under_torque_too(
 
 @pytest.mark.parametrize('direction', [1.0, -1.0])
 @pytest.mark.parametrize('change_point', CHANGE_POINTS)
-def test_step_that_ends_on_a_change_point_is_no_obstacle(
+def test_step_may_end_on_a_change_point(
     change_point: float, direction: float,
 ) -> None:
-    """Uniform links turn at constant rates: binary fractions bring them onto it."""
+    """Uniform links turn at constant rates, and binary fractions end exactly on it."""
     step, steps, rate = 2.0**-11, 128, 0.25 * direction
     start = make_state(np.tile([0.5, 0.5 + change_point - rate * step * steps / 2], 2),
                        np.tile([0.0, rate], 2))
@@ -241,11 +241,11 @@ def test_linkage_at_rest_on_a_change_point_stays(change_point: float) -> None:
 
 
 @pytest.mark.parametrize(('change_point', 'sign'), [(0.0, 1.0), (np.pi, -1.0)])
-def test_opposite_torques_choose_the_other_branch_from_rest(
+def test_opposite_torques_at_rest_lead_to_the_other_branch(
     change_point: float, sign: float,
 ) -> None:
     """
-    On the change point they drive `eta = omega_c - omega_a`, with `omega_d - omega_b = +-eta`.
+    On the change point the torques drive `eta = omega_c - omega_a`; `omega_d - omega_b = +-eta`.
 
     The generalized force on eta is `((tau_a - tau_c) +- (tau_b - tau_d)) / 2`.
     """
@@ -262,9 +262,9 @@ def test_opposite_torques_choose_the_other_branch_from_rest(
 
 def thousandth_passage(seed: int) -> tuple[Mechanism, Array]:
     """
-    Draw a linkage and its passage: any rhombus or parallelogram, any rate from 0.01 to 3 rad/s.
+    Draw a rhombus or parallelogram and its passage at a rate from 0.01 to 3 rad/s.
 
-    One of three starts on the change point, and one of three is uniform and meant to hit it.
+    A third starts on the change point, and a third is uniform and has a step that ends on it.
     """
     rng = np.random.default_rng(seed)
     length_a = rng.uniform(0.05, 1.5)
@@ -289,13 +289,13 @@ def thousandth_passage(seed: int) -> tuple[Mechanism, Array]:
 
 @pytest.mark.parametrize('hundred', range(10))
 def test_a_thousand_passages_stay_on_the_branch(hundred: int) -> None:
-    """No NaN, no jump, momentum kept to 1e-10 of its parts, opposite links parallel."""
+    """States are finite and continuous, momentum is conserved, opposite links stay parallel."""
     for seed in range(100 * hundred, 100 * hundred + 100):
         linkage, states = thousandth_passage(seed)
         assert np.isfinite(states).all(), f'seed {seed}'
         fastest = np.abs(states[:, LINK_RATES]).max()
         jump = np.abs(np.diff(states[:, LINK_ANGLES], axis=0)).max()
-        # 1e-11: what rounding in the closure leaves within 1e-4 rad of the change point.
+        # The rounding of the closure within 1e-4 rad of the change point is 1e-11.
         assert jump <= STEP * fastest + 1e-11, f'seed {seed}'
         few = states[::max(1, len(states) // 20)]
         drift = max(abs(momentum(linkage, x) - momentum(linkage, states[0])) for x in few)
@@ -307,7 +307,7 @@ def test_a_thousand_passages_stay_on_the_branch(hundred: int) -> None:
 # --- Imperfect lengths: they fold -------------------------------------------------------------
 
 def fold(mismatch: float, change_point: float, rate: float, link: int) -> Case:
-    """Send a rhombus, one link of which is longer by a share `mismatch`, to a change point."""
+    """Return the case of a rhombus with one longer link that moves to a change point."""
     lengths = np.full(4, 0.1)
     lengths[link] *= 1.0 + mismatch
     linkage = Mechanism(
@@ -327,14 +327,14 @@ FOLDS = [(1e-3, 0.0, 1.0, 0), (-1e-3, np.pi, -3.0, 1), (1e-4, np.pi, 0.3, 2), (-
 def test_mismatch_folds_as_kane_equations_do(
     mismatch: float, change_point: float, rate: float, link: int,
 ) -> None:
-    """Beside SymPy's derivation, integrated with steps that follow the fold: 1e-5 deg."""
+    """The derivation by SymPy with adaptive steps agrees to 1e-5 deg."""
     pytest.importorskip('sympy')
     from fourbar_ros.studies.independent import kane
     case = fold(mismatch, change_point, rate, link)
     expected = kane.simulate(case).link_angles
     np.testing.assert_allclose(
         simulate(case).link_angles, expected, rtol=0.0, atol=np.deg2rad(1e-5))
-    # It did fold: one pair of links on a line has opened, not the other.
+    # The linkage has folded: one pair of opposite links is not parallel.
     assert np.abs(expected[-1, 2] - expected[-1, 0]) > 0.2
 
 
@@ -342,7 +342,7 @@ def test_mismatch_folds_as_kane_equations_do(
 def test_mismatch_folds_as_in_a_stiff_engine(
     mismatch: float, change_point: float, rate: float, link: int,
 ) -> None:
-    """Beside MuJoCo, RK4 at 0.1 ms, as stiff as it stays stable: to the same side, 0.1 deg."""
+    """MuJoCo with RK4 at 0.1 ms and its stiffest stable closure agrees to 0.1 deg."""
     pytest.importorskip('mujoco')
     from fourbar_ros.studies.independent.mujoco_model import MujocoLinkage, State, stiff
     case = fold(mismatch, change_point, rate, link)
@@ -356,7 +356,7 @@ def test_mismatch_folds_as_in_a_stiff_engine(
 
 @pytest.mark.parametrize('change_point', CHANGE_POINTS)
 @pytest.mark.parametrize('mismatch', [1e-15, 1e-12, 1e-10, 1e-9, -3e-9, 5e-9, -8e-9, 9.9e-9])
-def test_mismatch_below_resolution_passes_and_loses_nothing(
+def test_mismatch_below_resolution_passes_and_conserves_energy(
     mismatch: float, change_point: float,
 ) -> None:
     """Lengths within 1e-8 count as equal."""
@@ -371,10 +371,10 @@ def test_mismatch_below_resolution_passes_and_loses_nothing(
 
 @pytest.mark.parametrize('change_point', CHANGE_POINTS)
 @pytest.mark.parametrize('mismatch', [1.1e-8, -2e-8, 1e-7])
-def test_least_mismatch_that_counts_folds_and_loses_little(
+def test_smallest_mismatch_above_resolution_folds(
     mismatch: float, change_point: float,
 ) -> None:
-    """The step divided most often is the limit: 1e-6 of the energy."""
+    """The largest number of divisions of a step limits the energy error to 1e-6."""
     for rate in (1.0, -0.1):
         case = fold(mismatch, change_point, rate, 1)
         motion = simulate(case)
@@ -385,7 +385,7 @@ def test_least_mismatch_that_counts_folds_and_loses_little(
 
 
 def test_sign_of_the_mismatch_decides_the_side() -> None:
-    """The links turn over about joint 3 or about joint 1, by which link is too long."""
+    """The links turn about joint 3 or joint 1, depending on the longer link."""
     ends = [simulate(fold(mismatch, 0.0, 1.0, 0)).link_angles[-1] for mismatch in (1e-3, -1e-3)]
     turned = [end[2] - end[0] for end in ends]
     assert turned[0] < -0.5
@@ -393,20 +393,20 @@ def test_sign_of_the_mismatch_decides_the_side() -> None:
 
 
 def test_eta_at_rest_leads_to_the_folded_branch() -> None:
-    """Where only a with b, and c with d, turn, joint 4 stays on joint 2."""
+    """When a turns with b, and c with d, joint 4 stays on joint 2."""
     start = make_state(np.zeros(4), [1.0, 1.0, -1.0, -1.0])
     states = move_under_constant_torques(load_mechanism('paper'), start, NONE, STEP, 1000)
     assert branch_of(states[-1, LINK_ANGLES]) == 'folded'
     np.testing.assert_allclose(states[-1, 1] - states[-1, 0], 0.0, atol=ROUNDING)
 
 
-# --- From one form to the other ---------------------------------------------------------------
+# --- Change between the forms -----------------------------------------------------------------
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_switching_between_the_forms_leaves_no_step(
+def test_change_between_the_forms_is_continuous(
     seed: int, random_parallelogram: Draw,
 ) -> None:
-    """Acceleration, from differences of the rates, changes no more across it than elsewhere."""
+    """Second differences of the rates are no larger there than elsewhere."""
     rng = np.random.default_rng(seed)
     linkage = random_parallelogram(rng)
     start = parallel_state(rng, 0.33, np.array([0.2, -0.6]))

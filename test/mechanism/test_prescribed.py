@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Wheels whose angle relative to their link is prescribed, mixed with wheels driven by torque."""
+"""Prescribed wheels, mixed with wheels driven by torque."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,14 +21,14 @@ Draw = Callable[[np.random.Generator], Mechanism]
 Mask = tuple[bool, ...]
 
 SEEDS = range(10)
-# Every choice of prescribed wheels but none.
+# All choices of at least one prescribed wheel.
 CHOICES = [choice for choice in product((False, True), repeat=4) if any(choice)]
 STEP = 1e-3
 
 
 def case_of(rng: np.random.Generator, linkage: Mechanism, state: Array, prescribed: Mask,
             time: float = 0.5) -> Case:
-    """Draw torques of some 0.1 N m, and wheel angles of some rad, up to 2 Hz."""
+    """Draw torques of about 0.1 N m and wheel angles of about 1 rad, up to 2 Hz."""
     given = np.array(prescribed)
     return Case(
         linkage, state[LINK_ANGLES], state[LINK_RATES], state[WHEEL_SPEEDS],
@@ -37,7 +37,7 @@ def case_of(rng: np.random.Generator, linkage: Mechanism, state: Array, prescrib
 
 
 def law(case: Case, times: Array) -> tuple[Array, Array]:
-    """Return angle and speed relative to the link, (n, 4) each, as the case prescribes them."""
+    """Return the prescribed angle and speed relative to the link, (n, 4) each."""
     omega = 2.0 * np.pi * case.frequency_hz
     phase = np.outer(times, omega) + case.phase
     return case.amplitude * np.cos(phase), -case.amplitude * omega * np.sin(phase)
@@ -45,7 +45,7 @@ def law(case: Case, times: Array) -> tuple[Array, Array]:
 
 # --- An independent derivation ----------------------------------------------------------------
 
-# One, two, all: each choice costs a derivation of its own, two seconds.
+# One, two and four prescribed wheels; each choice needs its own derivation of two seconds.
 @pytest.mark.parametrize('prescribed', [
     (False, True, False, False), (True, False, True, False), (True, True, True, True)])
 @pytest.mark.parametrize('seed', range(3))
@@ -59,8 +59,8 @@ def test_motion_agrees_with_kane_equations(
     linkage = random_linkage(rng)
     case = case_of(rng, linkage, random_state(rng, linkage, 0.7), prescribed, 0.2)
     ours, theirs = simulate(case, STEP), kane.simulate(case)
-    # Order four: (w h)^4 / 2880 of what the law, w up to 13 rad/s, moves: links by some 0.3 rad,
-    # wheels by 3 rad; w times as much in the speeds.
+    # The error is (w h)^4 / 2880 of the motion, with w up to 13 rad/s: 0.3 rad of links, 3 rad of
+    # wheels; w times as much in the speeds.
     np.testing.assert_allclose(ours.link_angles, theirs.link_angles, rtol=0.0, atol=1e-11)
     np.testing.assert_allclose(ours.link_rates, theirs.link_rates, rtol=0.0, atol=1e-10)
     np.testing.assert_allclose(
@@ -69,10 +69,10 @@ def test_motion_agrees_with_kane_equations(
 
 @pytest.mark.parametrize('prescribed', CHOICES)
 @pytest.mark.parametrize('seed', SEEDS)
-def test_prescribed_wheel_moves_links_as_a_driven_one_under_the_torque_it_needs(
+def test_prescribed_wheel_equals_a_driven_one_with_the_same_torque(
     seed: int, prescribed: Mask, random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:
-    """That torque is axial inertia times absolute acceleration; with friction and drag, too."""
+    """The torque is axial inertia times absolute acceleration, with friction and drag."""
     rng = np.random.default_rng(seed)
     linkage = random_linkage(rng)
     state = random_state(rng, linkage)
@@ -83,10 +83,10 @@ def test_prescribed_wheel_moves_links_as_a_driven_one_under_the_torque_it_needs(
     evaluate(state, drive, linkage.constants_with(np.array(prescribed)), around, ours)
     torques = np.where(prescribed, linkage.flywheel_inertias * ours[WHEEL_SPEEDS], drive)
     evaluate(state, torques, linkage.constants, around, driven)
-    # Two ways to sum up the same, which may cancel.
+    # The terms of the sums may cancel.
     size = np.abs(ours[LINK_RATES]).max()
     np.testing.assert_allclose(ours, driven, rtol=1e-11, atol=1e-11 * size)
-    # What was prescribed is the acceleration relative to the link.
+    # The law prescribes the acceleration relative to the link.
     relative = ours[WHEEL_SPEEDS] - ours[LINK_RATES]
     np.testing.assert_allclose(
         (linkage.flywheel_inertias * relative)[list(prescribed)], drive[list(prescribed)],
@@ -105,13 +105,13 @@ def case(request: pytest.FixtureRequest, random_linkage: Draw,
 
 
 def test_wheel_follows_its_law(case: Case) -> None:
-    """From whatever speed the case has for it."""
+    """The speed of the initial state has no effect."""
     motion = simulate(case, STEP)
     angles, speeds = law(case, case.times)
     given = case.prescribed
     omega = 2.0 * np.pi * case.frequency_hz
-    # Simpson's rule over one step leaves (w h)^4 / 2880 of an integral, in the speed of some
-    # amplitude times w; the angle is integrated once more.
+    # The error of Simpson's rule is (w h)^4 / 2880 of the integral. The speed is about amplitude
+    # times w; the angle is the integral of the speed.
     left = (omega * STEP)**4 / 2880.0 * np.abs(case.amplitude)
     relative = motion.flywheel_speeds_absolute - motion.link_rates
     assert (np.abs(relative - speeds) <= 2.0 * left * omega + 1e-13)[:, given].all()
@@ -119,7 +119,7 @@ def test_wheel_follows_its_law(case: Case) -> None:
     assert (np.abs(turned) <= 2.0 * left * (1.0 + omega * case.times[-1]) + 1e-13)[:, given].all()
 
 
-def test_driven_wheel_does_not_feel_the_others(case: Case) -> None:
+def test_driven_wheel_is_independent_of_the_others(case: Case) -> None:
     """Its absolute speed is the integral of its torque over its axial inertia."""
     motion = simulate(case, STEP)
     omega = 2.0 * np.pi * case.frequency_hz
@@ -131,8 +131,8 @@ def test_driven_wheel_does_not_feel_the_others(case: Case) -> None:
     assert (error <= left[~case.prescribed]).all()
 
 
-def test_momentum_is_kept(case: Case) -> None:
-    """Motors are inside, whatever they are told."""
+def test_momentum_is_conserved(case: Case) -> None:
+    """Motor torques are internal."""
     motion = simulate(case, STEP)
     momentum = [angular_momentum(case.mechanism, *rows) for rows in zip(
         motion.link_angles, motion.link_rates, motion.flywheel_speeds_absolute)]
@@ -140,7 +140,7 @@ def test_momentum_is_kept(case: Case) -> None:
 
 
 def test_held_wheel_counts_as_part_of_its_link(case: Case) -> None:
-    """At any constant angle; the others are driven by torque."""
+    """The angle is constant and arbitrary; the other wheels are driven by torque."""
     held = replace(case, amplitude=np.where(case.prescribed, 0.0, case.amplitude))
     heavier = replace(case.mechanism, link_inertias=case.mechanism.link_inertias + np.where(
         case.prescribed, case.mechanism.flywheel_inertias, 0.0))
