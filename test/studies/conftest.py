@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Short campaigns, for the tests of this folder."""
+"""Short campaigns for the tests of this folder."""
 
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec

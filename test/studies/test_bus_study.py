@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The study of the bus, for two seconds."""
+"""The study of the bus in two seconds."""
 
 from fourbar_ros.studies import bus
 import pytest
@@ -14,7 +14,7 @@ def test_nothing_is_lost_in_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(bus, 'ANSWER_TIMEOUT_S', 0.1)     # the largest that is allowed
     result = bus.run(lambda items, _: items, seconds=2)
     assert result.data['ticks'] == 500
-    # Twelve frames a tick, and heartbeats and clocks; one sample in a hundred is lost.
+    # There are twelve frames a tick, heartbeats and clocks; one sample in a hundred is lost.
     assert result.data['frames_received'] > 0.97 * 12 * 500
     assert result.data['frames_sent'] == 5 * 500 + 1
     for kind in ('lost_angles', 'lost_heartbeats', 'replayed', 'wrong_time',

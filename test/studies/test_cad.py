@@ -30,7 +30,7 @@ AMPLITUDE = 50.0
 
 
 def gain(inertia: float, wheel: float, length: float = 0.1, mass: float = 0.02) -> float:
-    """Return by how much a pair turns per turn of its wheels, from momentum by hand."""
+    """Return the turn of a pair per turn of its wheels, from momentum by hand."""
     return 2.0 * wheel / (2.0 * inertia + 0.5 * mass * length ** 2 + 2.0 * wheel)
 
 
@@ -68,12 +68,12 @@ def test_any_defect_keeps_momentum() -> None:
             middle = slice(10, -10, 10)
             momenta = [angular_momentum(mechanism, *state) for state in zip(
                 angles[middle], rates[middle], rates[middle] + np.outer(driving, driven)[middle])]
-            # Accuracy of differences of angles a tenth of a second apart.
+            # Accuracy of differences of angles over a tenth of a second.
             limit = 0.01 * 3.4e-7 * driven.sum() * np.abs(driving).max()
             assert float(np.abs(momenta).max()) < limit, name
 
 
-def test_offset_along_the_link_does_what_one_across_does() -> None:
+def test_offset_along_the_link_has_the_effect_of_one_across() -> None:
     """The square of the distance couples the pairs, docs/studies/cad.md."""
     for size in (0.003, 0.01):
         for test in (0, 1):
@@ -82,7 +82,7 @@ def test_offset_along_the_link_does_what_one_across_does() -> None:
 
 
 @pytest.mark.parametrize('name', [name for name, defect in DEFECTS.items() if defect.even])
-def test_sign_of_even_defects_changes_nothing(name: str) -> None:
+def test_sign_of_even_defects_has_no_effect(name: str) -> None:
     for test in (0, 1):
         assert rms({name: -0.01}, test, AMPLITUDE) == pytest.approx(
             rms({name: 0.01}, test, AMPLITUDE), rel=1e-9)
@@ -102,15 +102,15 @@ def test_no_defect_is_no_difference() -> None:
 @pytest.mark.parametrize(('name', 'sign', 'test'), [
     ('offset_y_same', 1.0, 0), ('offset_y_inside', -1.0, 1), ('inertia_ac', -1.0, 0),
     ('length_a', 1.0, 1)])
-def test_size_makes_the_number(name: str, sign: float, test: int) -> None:
+def test_size_reproduces_the_difference(name: str, sign: float, test: int) -> None:
     size = size_for(name, sign, test, AMPLITUDE)
     assert np.sign(size) == sign
     assert rms({name: size}, test, AMPLITUDE) == pytest.approx(RMS[test], rel=1e-8)
 
 
-def test_what_has_no_effect_has_no_size() -> None:
+def test_defect_without_effect_has_no_size() -> None:
     assert np.isnan(size_for('inertia_bd', 1.0, 0, AMPLITUDE))
-    # Too large a size for so little motion.
+    # The size of this difference would exceed its limit.
     assert np.isnan(size_for('inertia_all', -1.0, 0, 0.1))
 
 
@@ -135,7 +135,7 @@ def test_fits_reproduce_both_numbers_and_all_statements(fitted) -> None:
 
 
 @pytest.mark.slow
-def test_kanes_method_comes_to_the_same_numbers(fitted) -> None:
+def test_kanes_method_gives_the_same_differences(fitted) -> None:
     """Nominal and defective linkage by SymPy along the chain, integrated by SciPy."""
     pytest.importorskip('sympy')
     from fourbar_ros.studies.independent import kane
@@ -155,7 +155,7 @@ def test_kanes_method_comes_to_the_same_numbers(fitted) -> None:
             assert found == pytest.approx(RMS[test], abs=1e-7)
 
 
-def test_two_defects_leave_the_amplitude_open(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_defects_do_not_determine_the_amplitude(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cad, 'PAIR_AMPLITUDES', np.array([20.0, 80.0]))
     found = fit_two(('inertia_all', 'offset_y_inside'))
     assert [each.amplitude for each in found] == [20.0, 80.0]
@@ -189,7 +189,7 @@ def test_study_passes_its_checks_and_rules_out_defects(result: Result) -> None:
         np.sqrt(0.5), rel=1e-6)
     assert document['best_by_start_theta_deg']['90'] is None
     assert document['best_by_start_theta_deg']['60'] == document['best']
-    # In radians it would take more than half a link.
+    # In radians the offset would be more than half a link.
     assert max(document['rms_of_largest_offset_deg']) < np.degrees(0.1)
 
 
@@ -208,8 +208,8 @@ def test_tables_contain_the_results(result: Result) -> None:
 
 
 @pytest.mark.slow
-def test_figure_is_whole(result: Result) -> None:
-    """Something is drawn in the middle, and nothing at the edges, where it would be cut."""
+def test_figure_is_complete(result: Result) -> None:
+    """The figure has contents in the middle and none at the edges."""
     image = pytest.importorskip('matplotlib.image')
     assert result.skipped == []
     png = result.files['cad.png']

@@ -153,7 +153,7 @@ def test_interrupt_of_all_processes_ends_them_without_output(
     process.stdout.readline()
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=60.0)
-    # It may come between a word and the end of its line.
+    # The interrupt may come between a word and the end of its line.
     assert out.endswith('interrupted\n')
     assert err == ''
     assert process.returncode == 0
@@ -161,7 +161,7 @@ def test_interrupt_of_all_processes_ends_them_without_output(
 
 
 def group_exists(group: int) -> bool:
-    """Tell whether any process of a group exists."""
+    """Return whether any process of a group exists."""
     try:
         os.killpg(group, 0)
     except ProcessLookupError:

@@ -28,10 +28,10 @@ INERTIA, MASS = 2.2e-5, 0.02
 
 def by_hand(offsets: tuple[float, ...], theta: float) -> float:
     """
-    Work out cond(A) of a rhombus from the mass centres of its links, a with c and b with d.
+    Compute cond(A) of a rhombus from the mass centres of its links.
 
-    Each mass centre is `p e^(i phi_a) + q e^(i phi_b)`, less the mean; from their distances come
-    the inertias of the pairs, and from their scalar products how they are coupled.
+    Each mass centre is `p e^(i phi_a) + q e^(i phi_b)` minus the mean. The inertias of the pairs
+    follow from their distances, the coupling from their scalar products.
     """
     a, b, c, d = offsets
     half = 0.5 * LENGTH
@@ -45,7 +45,7 @@ def by_hand(offsets: tuple[float, ...], theta: float) -> float:
 
 @pytest.mark.parametrize('ratio', [0.25, 0.5, 1.0, 1.7, 2.0, 4.0])
 def test_parallelogram_by_hand(ratio: float) -> None:
-    """Each pair carries the other one at half its length; nothing couples them."""
+    """Each pair moves the mass of the other one at half its length, without coupling."""
     a, b = (2.0 * INERTIA + 0.5 * MASS * (scale * LENGTH) ** 2 for scale in (ratio, 1.0))
     for theta in (0.01, 0.3, 1.5, 3.0):
         assert condition(parallelogram(ratio), theta) == pytest.approx(max(a, b) / min(a, b))
@@ -74,7 +74,7 @@ def test_offsets_of_a_and_c_inwards_and_b_and_d_outwards_leave_cond_at_1() -> No
 
 
 def test_cond_depends_on_the_sign_of_unequal_offsets() -> None:
-    """For equal offsets it does not, in any convention."""
+    """For equal offsets it does not depend on the sign, in any convention."""
     unequal = (1.0, 0.3, 0.5, 0.2)
     assert condition(rhombus(unequal, 0.04), 0.3) != pytest.approx(
         condition(rhombus(unequal, -0.04), 0.3), rel=1e-3)
@@ -126,7 +126,7 @@ def test_grids_are_written_and_symmetric(result: Result) -> None:
 
 
 def test_near_a_change_point_four_wheels_keep_the_gain_that_a_and_b_lose(result: Result) -> None:
-    """cond(A) of equal links does not indicate it."""
+    """The loss of gain does not show in cond(A) of equal links."""
     rows = list(csv.DictReader(StringIO(str(result.files['conditioning_hidden.csv']))))
     equal = [row for row in rows if row['linkage'] == 'equal links']
     longer = [row for row in rows if row['linkage'] != 'equal links']
@@ -156,8 +156,8 @@ def test_without_a_mechanism_there_is_no_third_figure() -> None:
         studied('no such linkage')
 
 
-def test_figures_are_whole(result: Result) -> None:
-    """Something is drawn in the middle, and nothing at the left edge, where it would be cut."""
+def test_figures_are_complete(result: Result) -> None:
+    """Figures have contents in the middle and none at the left edge."""
     image = pytest.importorskip('matplotlib.image')
     assert result.skipped == []
     for name in ('conditioning', 'conditioning_hidden', 'conditioning_linkage'):

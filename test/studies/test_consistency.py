@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Statistics of consistency on numbers whose answer is known, and what the study makes of runs."""
+"""Statistics of consistency on known samples, and the study on runs."""
 
 from dataclasses import replace
 from math import inf, isnan, nan
@@ -34,7 +34,7 @@ def scenario() -> Scenario:
 
 
 def test_errors_drawn_from_their_covariance_are_within_bounds() -> None:
-    """Seed 0, 1000 draws of four numbers; of 10 000 seeds one fails. Half the covariance does."""
+    """1000 draws of four numbers, seed 0; half of the covariance is out of bounds."""
     rng = np.random.default_rng(0)
     root = rng.standard_normal((1000, 4, 4)) * [1e-3, 1.0, 1e2, 1.0]
     covariances = root @ np.swapaxes(root, 1, 2)
@@ -54,17 +54,17 @@ def test_bounds_are_those_of_scipy_and_none_without_degrees() -> None:
     assert isnan(high[3])
 
 
-def test_share_is_of_what_has_bounds() -> None:
+def test_share_counts_samples_with_bounds() -> None:
     values, low = np.array([1.0, 2.0, 3.0, 4.0, nan]), np.array([1.0, 1.0, 1.0, nan, 1.0])
     assert share_inside(values, low, low + 1.0) == pytest.approx(2.0 / 3.0)
     assert isnan(share_inside(values, low * nan, low))
 
 
-def test_white_series_stays_in_its_bounds_as_often_as_they_say() -> None:
+def test_bounds_of_a_white_series_have_their_coverage() -> None:
     """
-    Seed 1; 400 autocorrelations, a third of the samples lost.
+    The series has 400 autocorrelations, and a third of the samples is lost; seed 1.
 
-    The share inside 95 % bounds has a standard error of 1.1 %; four of them are let pass.
+    The share inside 95 % bounds has a standard error of 1.1 %; the tolerance is four of them.
     """
     rng = np.random.default_rng(1)
     series = 3.0 * rng.standard_normal((5000, 20))
@@ -74,7 +74,7 @@ def test_white_series_stays_in_its_bounds_as_often_as_they_say() -> None:
 
 
 def test_coloured_series_has_the_autocorrelation_of_its_recursion() -> None:
-    """Seed 2; x(k+1) = 0.5 x(k) + noise: 0.5^lag, within four of Bartlett's standard errors."""
+    """For x(k+1) = 0.5 x(k) + noise it is 0.5^lag, within four standard errors (Bartlett)."""
     rng = np.random.default_rng(2)
     series = np.zeros((40_000, 1))
     for n, noise in enumerate(rng.standard_normal(len(series) - 1)):
@@ -86,8 +86,8 @@ def test_coloured_series_has_the_autocorrelation_of_its_recursion() -> None:
     assert share_inside(found, -bounds, bounds) == 0.0
 
 
-def test_products_of_runs_add_up_and_do_not_mix() -> None:
-    """The end of a run is no neighbour of the begin of the next."""
+def test_products_of_runs_are_summed_without_mixing() -> None:
+    """The end of a run and the begin of the next one are no neighbours."""
     one, other = np.array([[1.0], [2.0], [nan], [4.0]]), np.array([[10.0]])
     sums, counts = lagged_products(one, 2)
     assert sums.tolist() == [[21.0], [2.0], [8.0]]
@@ -99,7 +99,7 @@ def test_products_of_runs_add_up_and_do_not_mix() -> None:
 
 @pytest.mark.parametrize('late', [0, 3])
 def test_bound_of_a_linear_system_is_the_covariance_of_its_kalman_filter(late: int) -> None:
-    """Of a system that changes from step to step, seed 3; late: carried on by that many steps."""
+    """The system is time-variant, seed 3; `late` is the number of predicted steps."""
     rng = np.random.default_rng(3)
     steps, size = 40, 3
     transitions = np.eye(size) + 0.3 * rng.standard_normal((steps - 1, size, size))
@@ -135,9 +135,9 @@ def test_bound_equals_the_covariance_of_the_filter_without_losses(
     matched: bool, scenario: Scenario,
 ) -> None:
     """
-    Along one trajectory it is the filter's covariance, but for linearisation at the estimate.
+    Along one trajectory they agree up to the linearisation at the estimate.
 
-    The angles' noise moves Gamma by 1e-3; with a latency it is that of the prediction.
+    The noise of the angles changes Gamma by 1e-3; with a latency the covariance is predicted.
     """
     if matched:
         scenario = consistency.matched(scenario, 0)
@@ -156,7 +156,7 @@ def test_bound_equals_the_covariance_of_the_filter_without_losses(
 
 
 def test_reversal_is_a_change_of_the_friction_regime() -> None:
-    """Joint 1 sticks and creeps to and fro, slides, turns around, and joint 4 comes along."""
+    """Joint 1 sticks, slides and reverses, and joint 4 slides too."""
     rates = np.zeros((14, 4))
     rates[:, 1] = [1e-5, -1e-5, 1e-5, 1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0, 0.0]
     rates[:, 2] = rates[:, 1]
@@ -181,7 +181,7 @@ def test_matched_table_follows_the_model_of_the_filter(scenario: Scenario) -> No
             table.surface.tilt_x) == (0.0, 0.0, 0.0, 0.0)
 
 
-def test_overconfident_filter_misses_the_checks(scenario: Scenario) -> None:
+def test_overconfident_filter_fails_the_checks(scenario: Scenario) -> None:
     """The random-walk torques are ten times the assumed ones, over two runs of 1.5 s."""
     made = replace(consistency.matched(scenario, 0), duration=1.5)
     wild = replace(made, table=replace(made.table, disturbance=replace(

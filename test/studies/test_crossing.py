@@ -34,7 +34,7 @@ import pytest
 from scipy.stats import binom
 
 SEEDS = range(40)
-# Parks for 5 s, and no more: the rest of the manoeuvre is as long again.
+# The first half of the manoeuvre: it parks for 5 s.
 PARKING = replace(MANOEUVRES['parking'], script=MANOEUVRES['parking'].script[:1], duration=9.5)
 
 
@@ -52,7 +52,7 @@ def outcome(passed: bool) -> CrossingOutcome:
     (0, 10, 0.0, 0.3085), (1, 10, 0.0025, 0.4450), (5, 10, 0.1871, 0.8129),
     (10, 10, 0.6915, 1.0), (100, 100, 0.9638, 1.0)])
 def test_interval_is_that_of_the_tables(passed: int, runs: int, low: float, high: float) -> None:
-    """Of Clopper and Pearson, as textbooks print it to four digits."""
+    """The reference is tables of the interval of Clopper and Pearson with four digits."""
     statistics = CrossingStatistics([outcome(number < passed) for number in range(runs)])
     assert (statistics.passed, statistics.runs) == (passed, runs)
     assert statistics.interval == pytest.approx((low, high), abs=5e-5)
@@ -61,7 +61,7 @@ def test_interval_is_that_of_the_tables(passed: int, runs: int, low: float, high
 @pytest.mark.parametrize(('passed', 'runs'), [
     (0, 300), (1, 3), (297, 300), (300, 300), (0, 30), (3, 30), (30, 30)])
 def test_interval_leaves_2_5_percent_on_either_side(passed: int, runs: int) -> None:
-    """At its ends what was found, or anything farther off, has a chance of 2.5 %."""
+    """At the ends of the interval the tail probability of the result is 2.5 %."""
     low, high = CrossingStatistics([outcome(number < passed) for number in range(runs)]).interval
     assert low <= passed / runs <= high
     if passed > 0:
@@ -80,7 +80,7 @@ def drawn(scenario: Scenario) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize('name', list(MANOEUVRES))
-def test_every_method_gets_the_same_draws(name: str) -> None:
+def test_every_method_has_the_same_draws(name: str) -> None:
     for seed in range(3):
         scenarios = [scenario_of(CrossingRun(MANOEUVRES[name], method, seed))
                      for method in METHODS]
@@ -96,13 +96,13 @@ def test_every_method_gets_the_same_draws(name: str) -> None:
             base}
 
 
-def test_every_seed_draws_something_else_within_its_spread() -> None:
-    """Seeds 0 to 39: that one of four links and two signs never comes has a chance of 4 %."""
+def test_every_seed_has_other_draws_within_the_spread() -> None:
+    """In seeds 0 to 39 one of four links or signs is missing with a probability of 4 %."""
     base = load_scenario('prototype')
     hard = MANOEUVRES['mismatch']
     scenarios = [scenario_of(CrossingRun(hard, 'four', seed)) for seed in SEEDS]
     for place, numbers in enumerate(zip(*(drawn(scenario) for scenario in scenarios))):
-        # All but the lengths, of which there are eight.
+        # There are only eight different lengths.
         if not 4 <= place < 8:
             assert len(set(numbers)) == len(SEEDS)
     longer = set()
@@ -118,7 +118,7 @@ def test_every_seed_draws_something_else_within_its_spread() -> None:
         assert abs(lengths[link]) == pytest.approx(hard.mismatch)
         assert np.count_nonzero(lengths) == 1
         longer.add((link, lengths[link] > 0.0))
-        # The controller knows that joints give, and not what was drawn.
+        # The model has compliant joints and not the drawn lengths.
         model = scenario.model
         np.testing.assert_array_equal(model.link_lengths, base.mechanism.link_lengths)
         np.testing.assert_array_equal(model.flywheel_inertias, base.mechanism.flywheel_inertias)
@@ -153,25 +153,25 @@ def test_crossing_in_motion_passes_by_every_method(method: str) -> None:
 
 
 @pytest.mark.slow
-def test_four_wheels_park_where_two_leave_the_branch() -> None:
+def test_four_wheels_stay_on_the_branch_that_two_leave() -> None:
     held = execute(CrossingRun(PARKING, 'four_held', 0))
     assert (held.passed, held.reason) == (True, '')
     for seed in range(3):
         found = execute(CrossingRun(PARKING, 'two', seed))
         assert not found.passed, f'seed {seed}'
         assert found.reason == 'elsewhere', f'seed {seed}'
-        # Opposite links turn apart by far more than joints of 1e4 N/m let them.
+        # The angle between opposite links is far larger than with four wheels.
         assert found.largest_eta > 10.0 * held.largest_eta, f'seed {seed}'
 
 
-def test_run_that_is_refused_has_failed_and_says_why() -> None:
+def test_refused_run_has_failed_with_the_reason() -> None:
     """80 degrees in a tenth of a second are too much for any motor."""
     at, phi_a, phi_b, _ = MANOEUVRES['motion'].script[0]
     fast = replace(MANOEUVRES['motion'], script=((at, phi_a, phi_b, 0.1),))
     found = execute(CrossingRun(fast, 'four', 0))
     assert not found.passed
     assert found.reason.startswith('setpoints, entry 1 at 0.5 s, refused: needs ')
-    # It stayed where it was: at the setpoint, and not at its goal.
+    # The linkage has not moved, so its error is the distance to the goal.
     assert found.error == pytest.approx(radians(80.0), abs=crossing_runs.GOAL_TOLERANCE)
 
 
@@ -180,7 +180,7 @@ Went = Callable[[Scenario, Any], Iterable[Any]]
 
 @pytest.fixture
 def went(monkeypatch: pytest.MonkeyPatch) -> Callable[[Went], CrossingOutcome]:
-    """Return a function that makes up how a crossing in motion goes, and what came of it."""
+    """Return a function that replaces the run of a crossing and returns its outcome."""
     def make(run_scenario: Went) -> CrossingOutcome:
         monkeypatch.setattr(crossing_runs, 'run_scenario', run_scenario)
         return execute(CrossingRun(MANOEUVRES['motion'], 'four', 0))
@@ -188,7 +188,7 @@ def went(monkeypatch: pytest.MonkeyPatch) -> Callable[[Went], CrossingOutcome]:
 
 
 def at(angles: Array) -> Any:
-    """Make a step at which the links are there."""
+    """Make a step with given true angles."""
     return SimpleNamespace(samples=SimpleNamespace(truth=SimpleNamespace(
         link_angles=angles, efforts=np.zeros(4))))
 
@@ -197,7 +197,7 @@ def goal_of(scenario: Scenario) -> Array:
     return np.tile(scenario.setpoints[-1].positions, 2)
 
 
-def test_end_counts_and_a_whole_turn_does_not(went: Callable[[Went], CrossingOutcome]) -> None:
+def test_final_error_ignores_whole_turns(went: Callable[[Went], CrossingOutcome]) -> None:
     def turned(scenario: Scenario, loop: Any) -> Iterable[Any]:
         loop.supervisor.arming.arm(0, ())
         return [at(goal_of(scenario) + 2.0 * np.pi + 0.9 * crossing_runs.GOAL_TOLERANCE)]
@@ -209,10 +209,10 @@ def test_end_counts_and_a_whole_turn_does_not(went: Callable[[Went], CrossingOut
 @pytest.mark.parametrize(('off', 'armed', 'reason'), [
     ([1.1, 0.0, 0.0, 0.0], True, 'elsewhere'), ([0.0, 0.0, -1.1, 0.0], True, 'elsewhere'),
     ([nan] * 4, True, 'elsewhere'), ([0.0] * 4, False, 'not armed since start')])
-def test_end_that_is_none(
+def test_end_off_the_goal_or_disarmed_fails(
     off: list[float], armed: bool, reason: str, went: Callable[[Went], CrossingOutcome],
 ) -> None:
-    """Of GOAL_TOLERANCE; not a number is nowhere near."""
+    """Errors are in units of GOAL_TOLERANCE; NaN is off the goal."""
     def ended(scenario: Scenario, loop: Any) -> Iterable[Any]:
         if armed:
             loop.supervisor.arming.arm(0, ())
@@ -244,7 +244,7 @@ def studied(passes: Callable[[CrossingRun], bool], monkeypatch: pytest.MonkeyPat
 
 
 def easy(run: CrossingRun) -> bool:
-    """Tell of each kind of run another share."""
+    """Return whether a run passes, with different shares for each kind of run."""
     if run.method == 'two':
         return run.manoeuvre.duration == MANOEUVRES['motion'].duration and (
             run.manoeuvre.mismatch == 0.0)
@@ -257,7 +257,7 @@ def test_numbers_are_of_the_runs_that_they_name(
     passes: Callable[[CrossingRun], bool], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     result = studied(passes, monkeypatch)
-    # Neither nan nor infinity anywhere.
+    # The document has neither NaN nor infinity.
     document = json.loads(json.dumps(result.data, allow_nan=False))
     rows = list(csv.DictReader(StringIO(str(result.files['crossing.csv']))))
     assert len(rows) == len(MANOEUVRES) * len(METHODS) + len(document['map']) == 9 + 48
@@ -290,7 +290,7 @@ def test_numbers_are_of_the_runs_that_they_name(
 def test_one_run_in_a_hundred_may_fail_and_not_more(
     lost: int, kept: bool, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Of four wheels with feedback; what the others do is shown and not held to anything."""
+    """The limit applies to four wheels with feedback; the other methods have no limit."""
     result = studied(lambda run: run.method == 'four_held' and run.seed >= lost, monkeypatch, 300)
     assert len(result.checks) == len(MANOEUVRES)
     assert [check.passed for check in result.checks] == [kept] * len(MANOEUVRES)
@@ -300,10 +300,10 @@ def test_one_run_in_a_hundred_may_fail_and_not_more(
 
 @pytest.mark.parametrize(('passes', 'runs'), [
     (easy, 60), (lambda run: False, 1), (lambda run: True, 300)], ids=['some', 'none', 'all'])
-def test_figure_is_whole(
+def test_figure_is_complete(
     passes: Callable[[CrossingRun], bool], runs: int, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Something is drawn in the middle and nothing at the edge, where it would be cut off."""
+    """The figure has contents in the middle and none at the edge."""
     image = pytest.importorskip('matplotlib.image')
     result = studied(passes, monkeypatch, runs, drawn=True)
     assert result.skipped == []
@@ -315,7 +315,7 @@ def test_figure_is_whole(
         assert edge.min() == 1.0
 
 
-def test_default_is_as_many_runs_as_the_limit_needs() -> None:
+def test_default_number_of_runs_suffices_for_the_limit() -> None:
     study = load_study('crossing')
     assert isinstance(study, partial)
     assert study.keywords['sample'].runs == 300

@@ -61,7 +61,7 @@ def test_energy_balance_needs_all_losses(present: Design) -> None:
 
 
 def test_joint_friction_leaves_momentum_in_the_wheels(present: Design) -> None:
-    """Four joints of 2e-4 N m slide for 10 s; drag takes part of it the other way."""
+    """Four joints of 2e-4 N m slide for 10 s; drag reduces the momentum."""
     cost = present.costs['configuration']
     impulse = cost.torques.sum(axis=0) * (cost.times[1] - cost.times[0])
     np.testing.assert_allclose(
@@ -76,13 +76,13 @@ def test_joint_friction_leaves_momentum_in_the_wheels(present: Design) -> None:
 
 
 def test_torques_make_the_motion_against_friction(present: Design) -> None:
-    """Through the integrator, with the same surroundings."""
+    """The integrator with the same surroundings reproduces the motion."""
     around = surroundings_of(TABLE)
     assert around.acting
     for cost in present.costs.values():
         state = make_state(cost.angles[0], cost.link_rates[0], cost.speeds[0])
         step, worst = float(cost.times[2] - cost.times[0]), 0.0
-        # Tilt moves the mass centre only, and is left out.
+        # Tilt moves the mass centre only, so the test omits it.
         level = surroundings(
             joint_coulomb=around.joint_coulomb, joint_viscous=around.joint_viscous,
             joint_static_ratio=float(around.joint_static_ratio),

@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What motions cost: momentum by hand, the integrator, eq. 8 by the pseudo-inverse."""
+"""Actuation cost of motions: momentum by hand, the integrator, eq. 8 by the pseudo-inverse."""
 
 import csv
 from dataclasses import replace
@@ -28,7 +28,7 @@ import pytest
 WHOLE = (pi / 2.0, pi / 2.0)
 PAPER = load_mechanism('paper')
 UNEQUAL = replace(PAPER, flywheel_inertias=PAPER.flywheel_inertias * (0.88, 0.41, 1.37, 0.77))
-# No pair of equal links, mass centres off the line.
+# A linkage without equal links, with mass centres off the lines of the links.
 ODD = Mechanism(
     link_lengths=[0.1, 0.12, 0.11, 0.14], link_masses=[0.02, 0.03, 0.025, 0.02],
     link_inertias=[2.2e-5, 3e-5, 2.5e-5, 4e-5],
@@ -59,7 +59,7 @@ def test_study_passes_its_checks_and_has_its_keys() -> None:
 
 @pytest.mark.parametrize('law', ['two_wheels', 'min_norm', 'min_energy'])
 def test_torques_make_the_motion_of_any_linkage(law: str) -> None:
-    """Through the integrator, which shares no line with the inverse dynamics."""
+    """The integrator, which is independent of the inverse dynamics, reproduces the motion."""
     cost = odd_step(np.array([30.0, -20.0, 10.0, 0.0]), law)
     assert integration_error(cost) < 1e-9
     total = [angular_momentum(ODD, *row) for row in zip(
@@ -70,7 +70,7 @@ def test_torques_make_the_motion_of_any_linkage(law: str) -> None:
 
 
 def test_least_accelerations_are_those_of_the_pseudo_inverse() -> None:
-    """Paper eq. 8, corrected: (G diag(If))^+ of the demand."""
+    """The reference is paper eq. 8, corrected: (G diag(If))^+ of the demand."""
     cost = odd_step()
     for n in (700, 2000, 3100):
         form = reduced_form(ODD, cost.angles[n], cost.link_rates[n])
@@ -84,8 +84,8 @@ def test_least_accelerations_are_those_of_the_pseudo_inverse() -> None:
             atol=1e-4 * np.abs(cost.torques).max())
 
 
-def test_work_is_what_the_energy_gains_where_no_motor_brakes() -> None:
-    """Until the fastest moment all motors push: work is the energy of wheels and links."""
+def test_work_is_the_gain_of_energy_while_no_motor_brakes() -> None:
+    """All motors drive until the peak rate, so the work is the energy of wheels and links."""
     cost = turn(PAPER, WHOLE, 'min_norm')
     middle = len(cost.times) // 2
     links = 0.5 * 2.0 * 1.44e-4 * cost.link_rates[middle, 0] ** 2
@@ -93,7 +93,7 @@ def test_work_is_what_the_energy_gains_where_no_motor_brakes() -> None:
         cost.energy[middle] + links, rel=1e-6)
 
 
-def test_nothing_is_below_the_least_and_balancing_reaches_it() -> None:
+def test_balanced_speeds_have_the_least_energy() -> None:
     for cost in (turn(PAPER, WHOLE, 'two_wheels'), turn(UNEQUAL, WHOLE, 'min_norm'),
                  turn(PAPER, WHOLE, 'min_norm', np.array([50.0, 20.0, -10.0, 0.0]))):
         assert (cost.energy >= cost.least_energy * (1.0 - 1e-12)).all()
@@ -103,7 +103,7 @@ def test_nothing_is_below_the_least_and_balancing_reaches_it() -> None:
     cost = balancing(kept)
     assert integration_error(cost) < 1e-9
     np.testing.assert_allclose(cost.speeds[-1], cost.balanced_speeds[-1], atol=1e-2)
-    # What moves no link changes no momentum of a pair.
+    # Null-space torques do not change the momentum of a pair.
     for pair in ([0, 2], [1, 3]):
         np.testing.assert_allclose(cost.speeds[:, pair] @ UNEQUAL.flywheel_inertias[pair],
                                    kept.speeds[:, pair] @ UNEQUAL.flywheel_inertias[pair])
@@ -112,7 +112,7 @@ def test_nothing_is_below_the_least_and_balancing_reaches_it() -> None:
         cost.torques[5:-5], atol=1e-4 * np.abs(cost.torques).max())
 
 
-def test_wheels_of_one_pair_cannot_turn_the_other(refuses) -> None:
+def test_wheels_of_one_pair_do_not_turn_the_other(refuses) -> None:
     with refuses(ActuationCostError, value=pytest.approx(1.0), limit=1e-9):
         actuation_cost(PAPER, rest_to_rest(1.0, (1.0, 1.0), 5.0), assemble(PAPER, 0.0, 1.0),
                        WeightedNorm(np.array([1.0, 0.0, 1.0, 0.0])))

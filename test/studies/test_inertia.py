@@ -58,7 +58,7 @@ def test_nominal_wheels_follow_exactly_and_are_the_closed_form() -> None:
 
 
 def test_eq9_is_that_of_inverse_dynamics() -> None:
-    """Of unequal wheels of equal speed in each pair, by the same units as the study of energy."""
+    """Unequal wheels have equal speeds in each pair; units are those of the energy study."""
     shares = np.array([0.7, 1.2, 1.3, 0.8])
     mechanism = replace(PAPER, flywheel_inertias=PAPER.flywheel_inertias * shares)
     of_unequal = turn(mechanism, (pi / 2.0, pi / 2.0), 'min_energy')
@@ -71,7 +71,7 @@ def test_eq9_is_that_of_inverse_dynamics() -> None:
 
 
 def test_correction_to_zero_error_keeps_the_differences_within_pairs() -> None:
-    """Opposite changes within a pair cost energy and turn nothing."""
+    """Opposite changes within a pair need energy and turn no link."""
     apart = candidate(a=0.3, c=-0.3, b=0.1)
     assert apart.eq9_without_error > 1.0 + 1e-3
     assert candidate(b=0.1, d=0.1).eq9_without_error == pytest.approx(1.0, abs=1e-12)
@@ -79,7 +79,7 @@ def test_correction_to_zero_error_keeps_the_differences_within_pairs() -> None:
 
 @pytest.mark.parametrize('weight', [1e-6, 3e-5, 1e-3, 0.1, 30.0])
 def test_least_at_a_weight_is_that_of_finite_elements(weight: float) -> None:
-    """The same minimum by piecewise linear functions: a positive definite linear system."""
+    """Piecewise linear functions give the same minimum by a positive definite linear system."""
     count = 4000
     s = np.linspace(0.0, 1.0, count + 1)
     h, mu = 1.0 / count, weight * (TURN / radians(0.1)) ** 2 * SQUARED_RATE
@@ -100,7 +100,7 @@ def test_least_at_a_weight_is_that_of_finite_elements(weight: float) -> None:
 
 
 def test_equal_pairs_are_the_best() -> None:
-    """The root of the least is convex in the square of the error: unequal errors do not pay."""
+    """The root of the least eq. 9 is convex in the squared error, so equal errors are best."""
     errors = np.radians(np.linspace(0.05, 20.0, 60))
     roots = np.sqrt([bound_at_error(error) for error in errors])
     slopes = np.diff(roots) / np.diff(errors ** 2)
@@ -127,7 +127,7 @@ def test_search_reaches_the_bound_and_repeats_with_its_seed() -> None:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Let searches be short and few; return the seeds that were searched with."""
+    """Make searches short and few; return the list of their seeds."""
     seeds: list[int] = []
     search_once = inertia_search.run_search
 
@@ -153,7 +153,7 @@ def test_finished_searches_are_not_repeated(quick: list[int], tmp_path: Path) ->
     assert quick == [0, 1, 2, 3, 4]
     stored = sorted((tmp_path / 'searches').iterdir())
     assert [path.name for path in stored] == [f'seed_{seed}.json' for seed in range(5)]
-    # As after a kill: one is missing, one is truncated, one has other settings.
+    # As after a kill, one result is missing, one is truncated, and one has other settings.
     stored[1].unlink()
     stored[2].write_text(stored[2].read_text()[:50])
     text = stored[3].read_text()

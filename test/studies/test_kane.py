@@ -48,7 +48,7 @@ def conserved(momentum_and_energy: Callable[..., tuple[float, float]]
 
 @pytest.fixture(scope='module')
 def moving(uneven: Mechanism) -> Case:
-    """Turn and deform a linkage with nothing equal to anything else, its wheels coasting."""
+    """Return the case of a moving linkage without equal parameters, with coasting wheels."""
     angles = assemble(uneven, 0.2, 1.3)
     across = np.stack([-np.sin(angles), np.cos(angles)]) * uneven.link_lengths * [-1, 1, 1, -1]
     rates = np.array([0.4, 0.1])
@@ -63,7 +63,7 @@ def moving(uneven: Mechanism) -> Case:
 @pytest.mark.parametrize('name', [
     'asymmetric', 'paper_all', 'paper_pair_ac', 'parallelogram_offset_spinning'])
 def test_reference_motions(name: str) -> None:
-    """The files hold ten digits or more behind the point."""
+    """The files have at least ten decimals."""
     path = REFERENCE / f'{name}.json'
     reference: dict[str, Any] = json.loads(path.read_text())
     motion = kane.simulate(load_case(path))
@@ -97,12 +97,12 @@ def test_wheels_locked_to_their_links_conserve_momentum_and_energy(
 def test_mixed_wheels_conserve_momentum_and_follow_their_laws(
     moving: Case, conserved: Conserved,
 ) -> None:
-    """Wheels a and d by angle, b and c by torque: motors are inside, momentum does not care."""
+    """Wheels a and d are prescribed, b and c driven; motor torques are internal."""
     prescribed = np.array([True, False, False, True])
     mixed = replace(moving, amplitude=np.array([9.0, 3e-5, -2e-5, 6.0]), prescribed=prescribed)
     motion = kane.simulate(mixed)
     momentum, energy = conserved(mixed)
-    # Little is left of what links and wheels hold against each other.
+    # The momenta of links and wheels almost cancel.
     scale = float((np.abs(motion.flywheel_speeds_absolute)
                    @ moving.mechanism.flywheel_inertias).max())
     np.testing.assert_allclose(momentum, momentum[0], rtol=0.0, atol=1e-11 * scale)
@@ -113,14 +113,14 @@ def test_mixed_wheels_conserve_momentum_and_follow_their_laws(
     relative = motion.flywheel_speeds_absolute - motion.link_rates
     given = -turn * mixed.amplitude * np.sin(turn * times + mixed.phase)
     np.testing.assert_allclose(relative[:, prescribed], given[:, prescribed], atol=1e-12)
-    # If d(omega_f)/dt = tau, whatever the link does.
+    # The law is If d(omega_f)/dt = tau, independent of the link.
     gained = mixed.amplitude / turn * (np.sin(turn * times + mixed.phase) - np.sin(mixed.phase))
     expected = mixed.flywheel_speeds_absolute + gained / moving.mechanism.flywheel_inertias
     np.testing.assert_allclose(motion.flywheel_speeds_absolute[:, ~prescribed],
                                expected[:, ~prescribed], rtol=0.0, atol=1e-10)
 
 
-def test_closure_stays(moving: Case) -> None:
+def test_closure_is_conserved(moving: Case) -> None:
     motion = kane.simulate(replace(moving, amplitude=np.full(4, 3e-5)))
     assert np.ptp(motion.link_angles, axis=0).min() > 0.1
     assert motion.closure_error.max() < 1e-13
@@ -129,12 +129,12 @@ def test_closure_stays(moving: Case) -> None:
     np.testing.assert_allclose(motion.closure_error, gap, rtol=0.0, atol=1e-15)
 
 
-def test_torque_that_holds_a_wheel_to_its_law_does_the_same(paper: Mechanism) -> None:
+def test_torque_of_a_prescribed_wheel_gives_the_same_motion(paper: Mechanism) -> None:
     """
-    Wheels a and c of a rhombus at rest: prescribed, or with the torque which that takes.
+    Wheels a and c of a rhombus at rest are prescribed, or driven by the equivalent torque.
 
-    The pair has inertia J = 2 I + m l^2 / 2, and J omega + 2 If (omega + dpsi/dt) = 0, so that
-    the torque is If d(omega + dpsi/dt)/dt = If (1 - k) d2psi/dt2 with k = 2 If / (J + 2 If).
+    The pair has inertia J = 2 I + m l^2 / 2, and J omega + 2 If (omega + dpsi/dt) = 0. The torque
+    is If d(omega + dpsi/dt)/dt = If (1 - k) d2psi/dt2 with k = 2 If / (J + 2 If).
     """
     wheel = float(paper.flywheel_inertias[0])
     inertia = 2.0 * 2.2e-5 + 0.02 * 0.1**2 / 2.0
@@ -164,7 +164,7 @@ def test_start_on_a_change_point_is_refused(paper: Mechanism, refuses: Refuses) 
 
 @pytest.mark.slow
 def test_motion_into_a_line_of_links_ends(uneven: Mechanism) -> None:
-    """A kite whose links c and d meet a and b: the steps would shrink without end."""
+    """Links c and d of a kite meet a and b, where the step size goes to zero."""
     kite = replace(uneven, link_lengths=np.array([0.1, 0.1, 0.12, 0.12]))
     angles = assemble(kite, 0.0, 0.05)
     rates = np.array([0.0, -1.0])

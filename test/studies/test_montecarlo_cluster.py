@@ -37,7 +37,7 @@ pytestmark = pytest.mark.slow
 
 
 class Cluster:
-    """A scheduler and workers in processes of their own, on loopback only."""
+    """A scheduler and workers in their own processes, on loopback only."""
 
     def __init__(self, folder: Path, wait_until: Wait) -> None:
         self.folder = folder
@@ -120,7 +120,7 @@ def test_two_workers_make_the_same_bytes_as_this_process(
     cluster: Cluster, study: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(montecarlo, 'MOST_IN_BATCH', 2)
-    # The second one comes while the first is at work or before, which changes nothing.
+    # The second worker may join before or during the work of the first.
     cluster.worker()
     cluster.worker()
     assert study('cluster', '--scheduler', cluster.address) == 0
@@ -146,7 +146,7 @@ NOWHERE = {f'distributed.comm.tls.{name}': '/nowhere/a.pem'
            for name in ('ca-file', 'client.cert', 'client.key')}
 
 
-@pytest.mark.parametrize(('address', 'configured', 'told'), [
+@pytest.mark.parametrize(('address', 'configured', 'part'), [
     ('', {}, 'port'),
     ('127.0.0.1', {}, 'port'),
     ('tcp://127.0.0.1', {}, 'port'),
@@ -157,7 +157,7 @@ NOWHERE = {f'distributed.comm.tls.{name}': '/nowhere/a.pem'
 ])
 def test_wrong_address_is_refused_before_a_client_is_made(
     study: Callable[..., int], capsys: pytest.CaptureFixture[str], tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, address: str, configured: dict[str, Any], told: str,
+    monkeypatch: pytest.MonkeyPatch, address: str, configured: dict[str, Any], part: str,
 ) -> None:
     """A client would wait, and print a traceback when it is deleted. No folder is left."""
     def fail(*_: Any, **__: Any) -> None:
@@ -166,7 +166,7 @@ def test_wrong_address_is_refused_before_a_client_is_made(
     with dask.config.set(configured):
         assert study('out', '--scheduler', address) == 2
     error, = capsys.readouterr().err.splitlines()
-    assert f'no scheduler at {address} (' in error and told in error
+    assert f'no scheduler at {address} (' in error and part in error
     assert '--scheduler' in error
     assert not (tmp_path / 'out').exists()
 
@@ -214,12 +214,12 @@ def test_cluster_that_stops_answering_is_reported(
     cluster: Cluster, campaign_file: Callable[..., str], monkeypatch: pytest.MonkeyPatch,
     stage: str,
 ) -> None:
-    """A process is halted or a cable unplugged: connections stay open without an answer."""
+    """A stopped process leaves connections open without an answer, as an unplugged cable does."""
     monkeypatch.setattr(campaign_cluster, 'ANSWER_TIMEOUT', 1.0 if stage == 'begin' else 300.0)
     made = load_campaign(campaign_file())
     worker = cluster.worker()
     if stage == 'begin':
-        # The scheduler knows the worker, and does not notice that it is halted.
+        # The scheduler does not detect that the worker is stopped.
         with distributed.Client(cluster.address, set_as_default=False) as client:
             client.wait_for_workers(1, timeout=300.0)
         worker.send_signal(signal.SIGSTOP)

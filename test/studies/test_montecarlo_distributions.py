@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Distributions and parameters of a campaign, and what it refuses before any run."""
+"""Distributions and parameters of a campaign, and refusals before the first run."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -23,7 +23,7 @@ from scipy.stats import kstest, lognorm, loguniform, norm, truncnorm, uniform
 import yaml
 
 RUNS = 2000
-# Share of good samples with which a test would fail; the seeds are fixed.
+# Significance level of the statistical tests; the seeds are fixed.
 SIGNIFICANCE = 1e-3
 
 
@@ -83,7 +83,7 @@ def test_a_run_does_not_depend_on_the_other_runs_or_parameters() -> None:
 
 
 def test_drawn_values_enter_the_scenario() -> None:
-    """Scaled, added, replaced; elements on their own or all by the same."""
+    """Values are scaled, added or replaced; elements have single draws or a common one."""
     made = campaign({
         'mechanism.flywheel_inertias': {'uniform': [0.9, 1.1], 'scale': True, 'each': True},
         'mechanism.com_positions[2]': {'uniform': [0.0, 0.01], 'add': True, 'each': True},
@@ -111,7 +111,7 @@ def test_drawn_values_enter_the_scenario() -> None:
     assert found.duration == drawn['duration']
     assert found.seed == made.seed_of(5)
     assert found.model.motor_resistances.tolist() == [1.0, 7.0, 1.0, 1.0]
-    # All else is nominal, above all the model.
+    # All other values are nominal, including the model.
     assert (found.model.flywheel_inertias == nominal.mechanism.flywheel_inertias).all()
     assert found.mechanism.link_lengths.tolist() == nominal.mechanism.link_lengths.tolist()
     assert found.estimator == nominal.estimator
@@ -128,7 +128,7 @@ def test_model_may_be_the_drawn_mechanism() -> None:
 
 
 def test_set_changes_mechanism_and_model() -> None:
-    """As a scenario with that mechanism; changes of the model come last."""
+    """The result is that of a scenario with this mechanism; the model is changed last."""
     vary = {'mechanism.link_inertias': {'uniform': [0.9, 1.1], 'scale': True}}
     masses = {'mechanism.link_masses': [0.5, 0.6, 0.7, 0.8]}
     made = campaign(vary, set={'model.link_masses.a': 0.4, **masses})
@@ -149,7 +149,7 @@ def test_scenario_with_its_own_model_keeps_it(tmp_path: Path) -> None:
 
 
 def test_mechanism_may_be_set_by_its_name() -> None:
-    """Then its values have names like those of any other."""
+    """The values of the mechanism have the usual names."""
     made = campaign({'mechanism.link_masses.a': {'choice': [2.0], 'scale': True}},
                     set={'mechanism': 'paper', 'table': 'ideal'})
     found, nominal = made.scenario(0), load_scenario('paper').mechanism
@@ -270,7 +270,7 @@ def test_wrong_keys_are_refused(
         campaign({A: {'uniform': [0, 1]}}, **others)
 
 
-@pytest.mark.parametrize(('vary', 'told'), [
+@pytest.mark.parametrize(('vary', 'part'), [
     # Refused at one end of the range, before any draw.
     ({'table.joints.coulomb': {'uniform': [-1e-9, 1.0]}}, 'joints.coulomb'),
     ({'controller.bandwidth': {'choice': [4.0, 21.0]}}, 'controller.bandwidth'),
@@ -282,23 +282,23 @@ def test_wrong_keys_are_refused(
     ({'table.joints.coulomb': {'normal': {'mean': 0.0, 'std': 1.0}}}, 'run '),
 ])
 def test_values_that_the_scenario_refuses_are_reported_before_any_run(
-        vary: dict[str, Any], told: str) -> None:
+        vary: dict[str, Any], part: str) -> None:
     """The message names the parameter, or the run."""
     made = campaign(vary, runs=20)
     with pytest.raises(CampaignError) as caught:
         made.check()
-    assert told in str(caught.value) and '\n' not in str(caught.value)
+    assert part in str(caught.value) and '\n' not in str(caught.value)
 
 
 def test_deprecated_name_of_the_model_draws_the_same(caplog: pytest.LogCaptureFixture) -> None:
-    """A file from before draws what it drew then, and one line reports the old name."""
+    """An old file has its old draws, and one line reports the old name."""
     vary = {'mechanism.link_masses': {'uniform': [0.5, 0.7]},
             'believed.link_inertias': {'uniform': [1.0, 2.0], 'scale': True}}
     made = campaign(vary, believed='drawn', set={'believed.link_masses.a': 0.4})
     assert made.model == 'drawn'
     assert len(caplog.messages) == 1 and "'believed' is deprecated" in caplog.text
     drawn = made.drawn(1)
-    # As commit 33b3bad drew them.
+    # The expected values are draws of commit 33b3bad.
     assert drawn == {'mechanism.link_masses': 0.6633142852302307,
                      'believed.link_inertias': 1.0249258844249016}
     found = made.scenario(1)
@@ -346,7 +346,7 @@ def test_draws_that_overflow_are_refused(given: dict[str, Any]) -> None:
     assert A in str(caught.value) and '\n' not in str(caught.value)
 
 
-def test_identity_is_all_that_the_numbers_depend_on(campaign_file: Callable[..., str]) -> None:
+def test_identity_has_all_that_the_numbers_depend_on(campaign_file: Callable[..., str]) -> None:
     same = load_campaign(campaign_file())
     for change in ({'runs': 50}, {'limits': {'work_j': {'at_most': 1.0}}}):
         assert load_campaign(campaign_file(**change)).digest == same.digest
@@ -366,6 +366,6 @@ def test_presets_can_be_run(name: str) -> None:
 
 
 def test_extremes_of_log_distributions_stay_inside() -> None:
-    """Rounding of exp and log leaves no draw beyond the ends by more than itself."""
+    """Draws exceed the ends by at most the rounding of exp and log."""
     made = campaign({'initial.link_a': {'loguniform': [0.1, 0.1]}})
     assert draws(made, 'initial.link_a', 5) == pytest.approx([exp(log(0.1))] * 5, rel=1e-15)

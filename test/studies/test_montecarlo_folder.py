@@ -1,7 +1,7 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The folder of a campaign: no finished run is lost, none is stored twice."""
+"""The folder of a campaign: every finished run is stored exactly once."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -45,7 +45,7 @@ def campaign(campaign_file: Callable[..., str]) -> Campaign:
 
 @pytest.fixture
 def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every run be a batch of its own."""
+    """Make every run its own batch."""
     monkeypatch.setattr(montecarlo, 'MOST_IN_BATCH', 1)
 
 
@@ -114,7 +114,7 @@ def test_killed_campaign_is_resumed(
 
 
 def alive(group: int) -> bool:
-    """Tell whether any process of a group is left."""
+    """Return whether any process of a group exists."""
     try:
         os.killpg(group, 0)
     except ProcessLookupError:
@@ -148,7 +148,7 @@ def test_finished_campaign_is_not_run_again_and_takes_more_runs(
         run(path, folder, runs=4)
 
 
-def test_progress_begins_with_what_is_done() -> None:
+def test_progress_begins_with_the_finished_runs() -> None:
     bar = tqdm(iter(range(7)), total=10, file=StringIO(), mininterval=0.0, miniters=1)
     resume_at(bar, 3)
     assert [bar.n for _ in bar][-1] == 9
@@ -174,9 +174,9 @@ def test_folder_of_another_campaign_is_refused(
     assert {file: file.read_bytes() for file in before} == before
 
 
-def test_folder_in_which_nothing_was_finished_belongs_to_no_campaign(
+def test_folder_without_finished_runs_belongs_to_no_campaign(
         campaign_file: Callable[..., str], tmp_path: Path, refuses: Refuses) -> None:
-    """Left empty by a campaign that finished no run, or by a killed one."""
+    """A campaign without a finished run, or a killed one, has left the folder."""
     first, other = load_campaign(campaign_file()), load_campaign(campaign_file('other', seed=6))
     place = tmp_path / 'out'
     with ResultFolder(place, first):
@@ -255,7 +255,7 @@ def test_many_parts_are_merged_and_duplicate_rows_count_once(
             assert len(parts(tmp_path)) <= 4
         before = folder.rows()
         assert before.to_pylist() == rows
-    # As after a crash between the new file and the removal of the old ones.
+    # The state is that after a crash between the new file and the removal of the old ones.
     with ResultFolder(tmp_path, campaign) as folder:
         folder.add(rows[2:4])
         (tmp_path / 'parts' / '.from_0000000_1.parquet.abcd').write_bytes(b'PAR1')

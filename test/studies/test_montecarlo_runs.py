@@ -56,7 +56,7 @@ def test_metrics_equal_those_of_the_published_topics() -> None:
         'peak_wheel_speed_rad_s': speeds.max(), 'speed_margin': 1.0 - speeds.max() / 300.0,
         'peak_torque_n_m': np.abs(topics['sim/flywheel_states.effort']).max()}
     for column, name in enumerate(('eq9_j_s', 'work_j', 'copper_loss_j'), 1):
-        # The sums begin anew at the setpoint.
+        # The sums restart at the setpoint.
         expected[name] = energies[-1, column] - energies[energies[:, column].argmin(), column]
     assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-9)
     assert set(found) - set(expected) == {'nees_per_degree_of_freedom'}
@@ -73,8 +73,8 @@ def test_nees_and_nis_grow_with_the_square_of_the_sensor_noise(
             'table.link_sensors.noise_rms': {'choice': [noise], 'scale': True}}), runs, seed=1)
         rows = [execute_run(made, run) for run in range(runs)]
         found[noise] = np.mean([[row[name] for name in names] for row in rows], axis=0)
-    # By a factor of four each, less the share of other errors. NEES has few independent samples
-    # in a run, so it has no upper bound here.
+    # The factor is four each, reduced by the share of other errors. NEES has few independent
+    # samples in a run, so the test has no upper bound.
     for more, less in ((2.0, 1.0), (1.0, 0.5)):
         assert (found[more] > 2.0 * found[less]).all()
         assert found[more][1] < 4.5 * found[less][1]
@@ -179,7 +179,7 @@ def test_number_of_a_run_out_of_range_is_refused(
 # The statistics
 
 def test_statistics_of_a_known_sample() -> None:
-    """Of 1 to 5, by hand: mean 3, variance 2.5, Student's t with 4 degrees of freedom 2.776."""
+    """The sample 1 to 5 has mean 3, variance 2.5, and Student's t with 4 degrees 2.776."""
     found = statistics(np.array([3.0, 1.0, nan, 5.0, 2.0, 4.0]))
     assert (found.n, found.mean) == (5, 3.0)
     assert found.std == pytest.approx(2.5 ** 0.5)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The linkage in MuJoCo moves as it should, as exactly as its soft closure and held torques allow.
+Accuracy of the linkage in MuJoCo, with its soft closure and held torques.
 
-How exact that is follows from the step h: torques held over a step but sampled in its middle lose
-the share (omega h)^2/24 of what varies with omega; Euler's method loses h/2 of the rates; and
-joint 3 gives, least with the stiffest settings.
+The error follows from the step h. Torques that are sampled in the middle of a step and held have a
+relative error of (omega h)^2/24 at the frequency omega. Euler's method has an error of h/2 times
+the rates. Joint 3 is compliant, least with the stiffest settings.
 """
 
 from collections.abc import Callable
@@ -79,7 +79,7 @@ def state_of(mechanism: Mechanism, angles: Any, rates: Any, wheel_speeds: Any) -
 
 
 def moving_state(mechanism: Mechanism, rng: np.random.Generator) -> State:
-    """Return a random state on the closure, some turns away from the first."""
+    """Return a random state on the closure, some turns away from zero."""
     angles = assemble(mechanism, *rng.uniform(0.3, 1.0, 2) * [1.0, 2.0])
     rates = rng.normal(size=2)
     rates = np.append(rates, reduced_form(mechanism, angles, rates).gamma @ rates)
@@ -92,7 +92,7 @@ def reference_named(name: str) -> Reference:
     return Reference(next(path for path in CASES if path.stem == name))
 
 
-def test_state_is_returned_as_it_was_set(uneven: Mechanism) -> None:
+def test_state_that_is_set_is_returned(uneven: Mechanism) -> None:
     rng = np.random.default_rng(1)
     linkage = MujocoLinkage(uneven)
     for _ in range(20):
@@ -106,7 +106,7 @@ def test_state_is_returned_as_it_was_set(uneven: Mechanism) -> None:
 
 
 def test_momentum_and_energy_are_those_of_the_mechanism(uneven: Mechanism) -> None:
-    """Masses, inertias, lengths and offsets of the model are right."""
+    """The sums depend on masses, inertias, lengths and offsets of the model."""
     import mujoco
 
     rng = np.random.default_rng(2)
@@ -128,12 +128,12 @@ def test_momentum_and_energy_are_those_of_the_mechanism(uneven: Mechanism) -> No
 def test_stiff_closure_has_the_error_of_the_held_torque(path: Path) -> None:
     reference = Reference(path)
     state = reference.move(stiff('RK4', STEP), reference.times[-1])
-    # A hundredth more for the compliant joint, and 1e-12 for the digits of the file.
+    # The tolerance has 1 % for the compliant joint and 1e-12 for the digits of the file.
     share = 1.01 * (reference.omega.max() * STEP) ** 2 / 24.0
     for name in QUANTITIES:
         most = np.abs(reference.expected[name]).max()
         assert reference.error(state, name) <= share * most + 1e-12, name
-    # Nothing pushes the linkage from outside.
+    # There is no external force.
     assert np.abs(state.centre_position).max() < 1e-11
 
 
@@ -147,7 +147,7 @@ def test_error_of_euler_is_half_a_step(path: Path) -> None:
 
 @each_case
 def test_default_closure_is_compliant(path: Path) -> None:
-    """The defaults of MuJoCo close the loop in 20 ms: good for 1e-4 rad, not for 1e-8 rad."""
+    """The default closure of MuJoCo, 20 ms, has errors between 1e-8 and 1e-4 rad."""
     reference = Reference(path)
     soft = reference.error(reference.move(Settings('RK4', STEP), 4.0))
     hard = reference.error(reference.move(stiff('RK4', STEP), 4.0))
@@ -156,7 +156,7 @@ def test_default_closure_is_compliant(path: Path) -> None:
 
 @pytest.mark.parametrize(('integrator', 'order'), [('Euler', 1), ('RK4', 2)])
 def test_error_shrinks_with_the_step(integrator: str, order: int) -> None:
-    """Of RK4 only the held torque is left, of second order."""
+    """With RK4 only the held torque contributes, which is of second order."""
     reference = reference_named('asymmetric')
     coarse, fine = (reference.error(reference.move(stiff(integrator, step), 4.0))
                     for step in (2e-3, 1e-3))
@@ -165,20 +165,20 @@ def test_error_shrinks_with_the_step(integrator: str, order: int) -> None:
 
 @pytest.mark.parametrize('sampled', [0.0, 0.5])
 @pytest.mark.parametrize('integrator', ['Euler', 'RK4'])
-def test_torque_is_held_from_where_it_is_sampled(integrator: str, sampled: float) -> None:
-    """The momentum of a wheel is the sum of its torques, whatever the motion of the links."""
+def test_torque_is_held_from_its_sampling_time(integrator: str, sampled: float) -> None:
+    """The momentum of a wheel is the sum of its torques, for any motion of the links."""
     reference = reference_named('asymmetric')
     state = reference.move(stiff(integrator, STEP), 0.5, sampled)
     moments = (np.arange(500) + sampled) * STEP
     given = sum(reference.torques_at(moment) for moment in moments) * STEP
-    # Not to the last digit: the wheel has a mass, which the mass centre of its link carries.
+    # The tolerance is for the mass of the wheel at the mass centre of its link.
     np.testing.assert_allclose(
         reference.mechanism.flywheel_inertias * state.flywheel_speeds_absolute[-1], given,
         rtol=1e-9)
 
 
-def test_momentum_stays(uneven: Mechanism) -> None:
-    """The closure and the motors, at their limits, are inner matters of a drifting linkage."""
+def test_momentum_is_conserved(uneven: Mechanism) -> None:
+    """Closure and motor torques are internal, for a drifting linkage with motors at limits."""
     state = moving_state(uneven, np.random.default_rng(3))
     times = np.array([0.0, 0.1, 0.2])
     moved = MujocoLinkage(uneven, stiff('RK4', STEP)).move(
@@ -194,12 +194,12 @@ def test_momentum_stays(uneven: Mechanism) -> None:
                                atol=1e-10)
 
 
-def test_locked_wheel_is_one_that_is_held_to_its_law(paper: Mechanism) -> None:
+def test_locked_wheel_follows_its_law(paper: Mechanism) -> None:
     """
-    Turn wheels a and c by 100 (cos(2 pi f t) - 1) relative to their links, as the paper does.
+    Wheels a and c turn by 100 (cos(2 pi f t) - 1) relative to their links, as in the paper.
 
-    The links of a pair together have 1.44e-4 kg m^2 in the rhombus, and they and their wheels no
-    momentum: (A + 2 If) phi' + 2 If psi' = 0. Links b and d stay.
+    A pair of links has A = 1.44e-4 kg m^2 in the rhombus, and the momentum of pair and wheels is
+    zero: (A + 2 If) phi' + 2 If psi' = 0. Links b and d are at rest.
     """
     omega, amplitude = 2.0 * np.pi * 0.1, 100.0
     inertia = paper.flywheel_inertias[0]
@@ -218,14 +218,14 @@ def test_locked_wheel_is_one_that_is_held_to_its_law(paper: Mechanism) -> None:
     np.testing.assert_array_equal(state.flywheel_speeds_absolute, state.link_rates)
 
 
-def test_free_wheels_beside_locked_ones_move_alike() -> None:
-    """A wheel whose law comes from a run with free wheels gives that run again."""
+def test_wheels_locked_to_the_law_of_free_ones_give_the_same_motion() -> None:
+    """The law of the locked wheels is the motion of a run with free wheels."""
     reference = reference_named('asymmetric')
     mechanism, times = reference.mechanism, np.arange(0.0, 0.5, STEP)
     free = reference.move(stiff('RK4', STEP), 0.5)
     run = MujocoLinkage(mechanism, stiff('RK4', STEP)).move(
         reference.start, times, reference.torques_at, sampled=0.5)
-    # Of wheels a and c: d2(psi)/dt2 is the absolute acceleration less that of the link.
+    # The relative acceleration of wheels a and c is the absolute one minus that of the link.
     link = np.gradient(run.link_rates, times, axis=0, edge_order=2)
     locked = np.array([True, False, True, False])
 
@@ -240,7 +240,7 @@ def test_free_wheels_beside_locked_ones_move_alike() -> None:
                                free.flywheel_speeds_absolute[:10, ~locked], rtol=1e-9)
 
 
-def test_lean_step_is_the_same_step() -> None:
+def test_lean_step_equals_the_full_step() -> None:
     reference = reference_named('asymmetric')
     settings = stiff('RK4', STEP)
     np.testing.assert_allclose(

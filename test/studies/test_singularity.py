@@ -37,10 +37,10 @@ SMALL = 1e-5
 
 
 def test_collapsed_linkage_moves_with_its_input_joint_locked() -> None:
-    """Not for an instant but as far as one likes: c and d turn about joints 2 and 4."""
+    """The motion is finite: c and d turn about joints 2 and 4 by any angle."""
     for eta in np.linspace(-3.0, 3.0, 13):
         assert closure_error(PROTOTYPE, [0.0, 0.0, eta, eta]) < 1e-15
-    # Elsewhere there is no other way for c and d than where they are, and one far off.
+    # At other angles links c and d have only two isolated assemblies.
     for theta in (0.2, AWAY, 1.5):
         gaps = [closure_error(PROTOTYPE, [0.0, theta, c, d])
                 for c in np.linspace(-3.1, 3.1, 63) for d in np.linspace(-3.1, 3.1, 63)
@@ -50,10 +50,10 @@ def test_collapsed_linkage_moves_with_its_input_joint_locked() -> None:
 
 @pytest.mark.parametrize('theta', [0.0, 0.3, AWAY])
 @pytest.mark.parametrize('locked', list(LOCKS))
-def test_motions_keep_the_loop_closed_and_nothing_else_does(
+def test_only_admissible_motions_keep_the_loop_closed(
     theta: float, locked: tuple[int, ...],
 ) -> None:
-    """To first order: the gap grows with the square of a motion, and linearly with the rest."""
+    """The gap is quadratic in an admissible motion, and linear in all others."""
     angles = np.tile([0.0, theta], 2)
     basis = motions(PROTOTYPE, theta, locked)
     assert basis.shape[1] == LOCKS[locked][0 if theta == 0.0 else 1]
@@ -74,13 +74,13 @@ def test_motions_keep_the_loop_closed_and_nothing_else_does(
 def test_modes_are_motions_at_zero() -> None:
     np.testing.assert_allclose(closure_jacobian(PROTOTYPE, 0.0) @ MODES, 0.0, atol=1e-16)
     assert rank(MODES) == 3
-    # eta is what it is called, and turns neither pair in the mean.
+    # Motion eta turns opposite links apart, and no pair in the mean.
     assert ETA[2] - ETA[0] == ETA[3] - ETA[1] == 1.0
     assert ETA[0] + ETA[2] == ETA[1] + ETA[3] == 0.0
 
 
-def test_motors_do_the_work_of_their_own_turning() -> None:
-    """A joint motor works on what its joint turns, a wheel on what its link turns back."""
+def test_generalized_forces_are_the_work_of_the_motors() -> None:
+    """The work of a joint motor is on the joint angle, that of a wheel on minus the link angle."""
     rng = np.random.default_rng(1)
     for _ in range(10):
         rates = rng.normal(size=4)
@@ -97,26 +97,26 @@ def test_no_joint_motor_turns_the_whole_and_one_alone_drives_one_motion() -> Non
         for joint in range(4):
             assert whole @ joint_motor(joint) == 0.0
             assert rank(generalized_forces(PROTOTYPE, theta, joint_motor(joint)[:, None])) == 1
-        # All of them together never do what four wheels do.
+        # The rank of all joint motors is lower than that of four wheels.
         assert rank(generalized_forces(PROTOTYPE, theta, DRIVES['four_joints'])) < rank(
             generalized_forces(PROTOTYPE, theta, DRIVES['four_wheels']))
 
 
-def test_four_wheels_drive_every_motion_alike_and_two_miss_one() -> None:
+def test_four_wheels_drive_every_motion_equally_and_two_miss_one() -> None:
     for theta in (-AWAY, -1e-3, 0.0, 1e-9, 0.3):
         gains = np.linalg.svd(
             generalized_forces(PROTOTYPE, theta, DRIVES['four_wheels']), compute_uv=False)
         np.testing.assert_allclose(gains, 1.0, atol=1e-12)
     missed = np.linalg.svd(generalized_forces(PROTOTYPE, 0.0, DRIVES['wheels_a_b']))
     left = motions(PROTOTYPE, 0.0) @ missed[0][:, 2]
-    # Neither a nor b moves in it: c and d turn.
+    # In this motion links c and d turn, and a and b rest.
     np.testing.assert_allclose(left[:2], 0.0, atol=1e-12)
     assert abs(left[2]) == pytest.approx(abs(left[3]))
 
 
 @pytest.mark.parametrize('theta', [0.01, 0.2, AWAY, 1.4])
 def test_stiffness_is_that_of_four_bodies_on_springs(theta: float) -> None:
-    """Link a on the ground, twelve coordinates less three, a torque on d, solved as it stands."""
+    """The reference solves nine coordinates with link a fixed and a torque on link d."""
     places = joint_positions(PROTOTYPE, np.tile([0.0, theta], 2))
     ends = {0: (0, 1), 1: (1, 2), 2: (2, 3), 3: (3, 0)}
     stiffness = np.zeros((9, 9))
@@ -129,7 +129,7 @@ def test_stiffness_is_that_of_four_bodies_on_springs(theta: float) -> None:
                 rows[0, at], rows[1, at + 1] = sign, sign
                 rows[:, at + 2] = sign * np.array([-arm[1], arm[0]])
         stiffness += STIFFNESS * rows.T @ rows
-    # Joint 1 locked: b does not turn.
+    # With joint 1 locked, link b does not turn.
     kept = [0, 1, 3, 4, 5, 6, 7, 8]
     torque = np.zeros(8)
     torque[-1] = 1.0
@@ -139,7 +139,7 @@ def test_stiffness_is_that_of_four_bodies_on_springs(theta: float) -> None:
 
 @pytest.mark.parametrize('theta', [0.05, AWAY, -0.3])
 def test_force_in_the_coupler_balances_the_torque(theta: float) -> None:
-    """Along c, about joint 4 that d turns on."""
+    """The force is along link c and has its moment about joint 4."""
     _, _, joint_3, joint_4 = joint_positions(PROTOTYPE, np.tile([0.0, theta], 2))
     arm = joint_3 - joint_4
     along_c = np.array([1.0, 0.0])
@@ -148,7 +148,7 @@ def test_force_in_the_coupler_balances_the_torque(theta: float) -> None:
     assert np.isnan(joint_force(PROTOTYPE, 0.0))
 
 
-def test_integrator_follows_opposite_wheels_and_no_joint_motor() -> None:
+def test_opposite_wheels_move_the_integrated_linkage_and_joint_motors_do_not() -> None:
     square = 0.5 * singularity_model.TORQUE * singularity_model.PUSH_TIME ** 2
     for shares in ([1.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, -1.0], [0.5, 0.5, -0.5, -0.5]):
         opened = integrate_eta(PROTOTYPE, np.array(shares), NOTHING)
@@ -167,7 +167,7 @@ def result() -> Result:
 
 
 @pytest.mark.slow
-def test_checks_are_kept_and_numbers_are_told(result: Result) -> None:
+def test_checks_pass_and_results_are_complete(result: Result) -> None:
     assert [check.name for check in result.checks if not check.passed] == []
     assert len({check.name for check in result.checks}) == len(result.checks)
     assert result.data['generalized_forces']['joint_1']['eta'] == [0.0]
@@ -185,8 +185,8 @@ def test_checks_are_kept_and_numbers_are_told(result: Result) -> None:
 
 
 @pytest.mark.slow
-def test_figure_is_whole(result: Result) -> None:
-    """Something is drawn in the middle, and nothing at the edges, where it would be cut."""
+def test_figure_is_complete(result: Result) -> None:
+    """The figure has contents in the middle and none at the edges."""
     image = pytest.importorskip('matplotlib.image')
     assert result.skipped == []
     png = result.files['singularity.png']

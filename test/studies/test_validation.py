@@ -30,7 +30,7 @@ def no_progress(items: Iterable[Any], total: int) -> Iterable[Any]:
 
 @pytest.fixture(scope='module')
 def comparisons(paper: Mechanism) -> list[EngineComparison]:
-    """Run the paper's tests with ours alone, standing in for Kane's engine as well."""
+    """Run the tests of the paper with our engine, also in place of Kane's method."""
     found = []
     for name, shape in validation.PAPER_TESTS.items():
         motion = ComparedMotion(name, validation.paper_test(paper, np.array(shape)))
@@ -43,21 +43,20 @@ def outcomes(comparisons: list[EngineComparison]) -> dict[str, bool]:
     return {check.name: check.passed for check in validation.checks(comparisons)}
 
 
-def test_the_turn_by_hand_balances_the_wheels(paper: Mechanism) -> None:
+def test_turn_by_hand_conserves_momentum(paper: Mechanism) -> None:
     """
-    Links and wheels of a pair hold no momentum together at any time.
+    The total momentum of links and wheels of a pair is zero at any time.
 
-    Checked with the momentum of the whole, in which opposite wheels and links of the other pair
-    rest.
+    The test uses the momentum of the whole, where the other pair rests.
     """
     case = validation.paper_test(paper, np.array([1.0, 0.0, 1.0, 0.0]))
     turn = validation.turn_by_momentum(case)
     rate = np.gradient(turn, case.times, edge_order=2)
     omega = 2.0 * np.pi * validation.FREQUENCY_HZ
     wheel = rate - omega * validation.AMPLITUDE * np.sin(omega * case.times)
-    # Two links about their mass centres, and each pair carries half the mass of the other.
+    # A pair has two inertias about mass centres, and half of the mass of the other pair.
     momentum = (2.0 * 2.2e-5 + 0.02 * 0.1**2 / 2.0) * rate + 2.0 * 3.4e-7 * wheel
-    # Central differences over 0.05 s leave (0.05 omega)^2 / 6 of the rate.
+    # The relative error of central differences over 0.05 s is (0.05 omega)^2 / 6.
     scale = 2.0 * 3.4e-7 * np.abs(wheel).max()
     assert np.abs(momentum).max() < 1e-3 * scale
     assert np.ptp(turn) == pytest.approx(0.94, abs=1e-3)
@@ -78,7 +77,7 @@ def test_all_checks_pass(comparisons: list[EngineComparison]) -> None:
 def test_wrong_motion_fails_its_check(
     name: str, links: list[int], missed: set[str], comparisons: list[EngineComparison],
 ) -> None:
-    """Two nanoradians at one time, where a nanoradian is the limit; no joint opens by 1e-12 m."""
+    """The error is two nanoradians at one time; the limit is one, and joint gaps are 1e-12 m."""
     def off(one: EngineComparison) -> EngineComparison:
         angles = one.ours.link_angles.copy()
         angles[100, links] += 2e-9
@@ -111,7 +110,7 @@ def test_differences_are_over_all_links_and_times(comparisons: list[EngineCompar
 def test_extrapolation_removes_the_second_order_error_of_mujoco(
     comparisons: list[EngineComparison], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An engine with an error of the square of its step is exact when extrapolated."""
+    """Extrapolation is exact for an engine with an error quadratic in its step."""
     def engine(step: float) -> IndependentEngine:
         return IndependentEngine('', lambda motion: (
             simulate(motion.case, comparison.STEP).link_angles + step**2))
