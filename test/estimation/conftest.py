@@ -9,6 +9,6 @@ import pytest
 
 @pytest.fixture(params=['paper', 'uneven'])
 def mechanism(request: pytest.FixtureRequest) -> Mechanism:
-    """Take the paper's linkage, then one without any symmetry."""
+    """Return the linkage of the paper, then one without any symmetry."""
     linkage: Mechanism = request.getfixturevalue(request.param)
     return linkage

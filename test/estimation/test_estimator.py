@@ -47,7 +47,7 @@ class Run:
 
     def tick(self, sensors: tuple[int, ...] | None = None, torques: Array | None = None,
              offsets: Array | None = None) -> Estimate | None:
-        """Advance by a period, measure with some sensors or all, some off, and estimate."""
+        """Advance by a period, measure with some or all sensors with offsets, and estimate."""
         before = self.plant.sense_wheels()
         self.plant.advance(8, np.zeros(4) if torques is None else torques)
         speeds = (self.plant.sense_wheels() - before) / 4e-3
@@ -64,7 +64,7 @@ class Run:
         return self.estimator.tick(self.stamp_ns, list(speeds))
 
     def ticks(self, count: int, *args: Any) -> Iterator[Estimate]:
-        """Go on for some ticks, all of which give an estimate."""
+        """Advance by some ticks, and check that all give an estimate."""
         for _ in range(count):
             estimate = self.tick(*args)
             assert estimate is not None
@@ -81,12 +81,12 @@ class Run:
                                estimate.link_rates - truth.link_rates])
 
     def unwrapped_error(self, estimate: Estimate) -> Array:
-        """Return the error of the angles (4,), whatever turn the filter started on."""
+        """Return the error of the angles (4,), relative to the turn of the start."""
         error = self.error(estimate)[:4]
         return error - 2.0 * pi * np.round(error / (2.0 * pi))
 
 
-# Following
+# Tracking the linkage
 
 @pytest.mark.parametrize('branch', ['open', 'crossed'])
 def test_errors_settle_within_their_sigmas(mechanism: Mechanism, branch: str) -> None:
@@ -94,7 +94,7 @@ def test_errors_settle_within_their_sigmas(mechanism: Mechanism, branch: str) ->
     run.after(250)
     for estimate in run.ticks(250):
         assert (np.abs(run.unwrapped_error(estimate)) < SIGMAS * estimate.angle_sigmas).all()
-    # A tenth of a degree at 250 Hz, and a model: the estimate is far better than a sample.
+    # By the model and samples at 250 Hz the error is far smaller than that of one sample.
     assert estimate.angle_sigmas[:2].max() < NOISE / 3.0
     assert np.abs(run.error(estimate)[4:]).max() < 0.02
 
@@ -109,8 +109,7 @@ def test_estimate_is_continuous_over_many_turns(mechanism: Mechanism, direction:
         angles.append(estimate.link_angles)
         errors.append(estimate.link_angles - run.plant.truth().link_angles)
     assert np.abs(np.ptp(angles, axis=0)).min() > 11 * 2.0 * pi
-    # From the second second on, when the unknown initial rate is known: no turn is ever gained,
-    # lost or passed through.
+    # After one second the initial rate is known, and the number of turns is constant.
     settled = np.array(errors[250:])
     turns = np.round(settled[0] / (2.0 * pi))
     assert np.abs(settled - 2.0 * pi * turns).max() < SIGMAS * NOISE
@@ -146,7 +145,7 @@ def test_start_needs_three_joint_encoders_beside_the_heading(
 
 
 def test_joint_encoders_alone_do_not_start_the_filter(paper: Mechanism) -> None:
-    """They do not measure the orientation of the whole."""
+    """Joint encoders do not measure the orientation of the whole."""
     run = Run(paper, InitialState(0.3, 1.6), joint_encoders('link_a'))
     assert run.tick((0, 1, 2, 3)) is None
     assert 'link_a' in run.estimator.waiting_for
@@ -167,7 +166,7 @@ def test_any_subset_of_links_updates_the_filter(links: tuple[int, ...], uneven: 
 
 
 def test_without_samples_wheels_alone_drive_the_prediction(mechanism: Mechanism) -> None:
-    """Silence of 0.2 s, with the motors working."""
+    """The sensors are silent for 0.2 s, and the motors give torque."""
     run = Run(mechanism, InitialState(0.3, 1.6, 'open', 0.2, -0.1))
     estimate = run.after(250)
     rate_error = np.abs(run.error(estimate)[4:]).max()
@@ -176,8 +175,8 @@ def test_without_samples_wheels_alone_drive_the_prediction(mechanism: Mechanism)
     for n in range(50):
         (estimate,) = run.ticks(1, (), 5e-5 * np.sin(0.2 * n + np.arange(4)))
         assert estimate.innovation is None
-    # The rate's error goes on, and one count of the encoders is If/I = 1 % of 0.1 rad/s; Gamma
-    # makes at most three of each.
+    # The error of the rate is constant, one count of the encoders is If/I = 1 % of 0.1 rad/s, and
+    # Gamma amplifies both by at most three.
     growth = 3.0 * (rate_error + 0.01 * 0.1) * 0.2
     assert np.abs(run.unwrapped_error(estimate)).max() < 3.0 * before + growth
     assert (estimate.angle_sigmas > sigmas).all()
@@ -221,12 +220,12 @@ def test_three_links_determine_the_branch(mechanism: Mechanism, branch: str, mis
         estimate = estimator.tick(FIRST_NS, STILL)
         assert estimate is not None, f'seed {seed}'
         wrapped = np.angle(np.exp(1j * (estimate.link_angles - angles)))
-        # Gamma of these linkages is at most 2, four numbers of twenty seeds stay within 4 sigma.
+        # Gamma of these linkages is at most 2; four numbers of twenty seeds are within 4 sigma.
         assert np.abs(wrapped).max() < 4.0 * 3.0 * NOISE, f'seed {seed}'
 
 
 def test_links_measured_one_after_the_other_start_the_filter(mechanism: Mechanism) -> None:
-    """As on a bus: each link has its own stamp, and no link suffices alone."""
+    """Each link has its own stamp, as on a bus, and no single link suffices."""
     angles = angles_of(mechanism, 'open')
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -311,7 +310,7 @@ def test_unusable_sample_is_rejected_whole_and_counted(
         running.estimator.measure(running.stamp_ns + PERIOD_NS, names, angles)
     assert running.estimator.rejected == Counter({kind: 1})
     assert running.estimator.last_rejection == str(caught.value)
-    # Nothing of it was kept: the tick's own sample is still welcome, and the only one.
+    # No part of the message was kept, so the sample of the tick is accepted.
     (estimate,) = running.ticks(1)
     assert np.abs(running.error(estimate)).max() < 1e-6
 
@@ -335,7 +334,7 @@ def test_late_sample_is_rejected(age_ms: int, running: Run) -> None:
 
 @pytest.mark.parametrize('age_s', [2, 3600])
 def test_very_late_sample_is_not_taken_as_new(age_s: int, running: Run) -> None:
-    """As old as after a restart of time, but the ticks go on: it has no effect."""
+    """The sample is as old as after a restart of time, but the ticks continue."""
     try:
         running.estimator.measure(
             running.stamp_ns - age_s * 1_000_000_000, list(LINK_NAMES), [0.5, 1.5, 0.5, 1.5])
@@ -375,7 +374,7 @@ def test_tick_not_newer_than_the_last_is_rejected(behind_ns: int, running: Run) 
 
 @pytest.mark.parametrize('jump_ns', [-5_000_000_000, 1_100_000_000, 3600 * 10 ** 9])
 def test_jump_of_time_begins_a_new_run(jump_ns: int, paper: Mechanism) -> None:
-    """Time goes back, or on after a gap, and the configuration is another."""
+    """Time decreases or has a gap, and the configuration is another one."""
     run = Run(paper, InitialState(), PERFECT)
     run.stamp_ns += 10_000_000_000
     run.after(10)
@@ -390,7 +389,7 @@ def test_jump_of_time_begins_a_new_run(jump_ns: int, paper: Mechanism) -> None:
 
 
 def test_new_run_forgets_the_sensors_of_the_last(paper: Mechanism) -> None:
-    """Time goes back, and one sensor is missing from then on."""
+    """Time decreases, and one sensor is missing afterwards."""
     run = Run(paper, InitialState())
     run.stamp_ns += 10_000_000_000
     run.after(10)
@@ -420,11 +419,11 @@ def test_reset_starts_again_on_the_same_turn(paper: Mechanism) -> None:
     assert run.estimator.starts == 2
     # Two periods at 6 rad/s.
     assert np.abs(after.link_angles - before.link_angles - 0.048).max() < 1e-3
-    # What was measured before stays forgotten, however late it comes: the rates are unknown.
+    # Samples from before the reset have no effect, so the rates are unknown.
     assert after.rate_sigmas.min() > 1.0
 
 
-def test_reset_before_the_first_tick_does_nothing(paper: Mechanism) -> None:
+def test_reset_before_the_first_tick_has_no_effect(paper: Mechanism) -> None:
     run = Run(paper, InitialState())
     run.estimator.reset()
     assert run.tick() is not None
@@ -450,7 +449,7 @@ def test_lost_filter_recovers(jump: float, paper: Mechanism) -> None:
     assert run.estimator.starts <= 2
 
 
-def test_noise_alone_never_restarts_it(paper: Mechanism) -> None:
+def test_noise_alone_does_not_restart_the_filter(paper: Mechanism) -> None:
     run = Run(paper, InitialState(0.0, 1.0, 'open', 0.3, 0.1), seed=4)
     run.after(2000)
     assert run.estimator.starts == 1
@@ -488,7 +487,7 @@ def test_wrong_sensor_is_gated_until_it_agrees_again(
 
 
 def test_gate_rejects_the_fraction_of_its_probability(paper: Mechanism) -> None:
-    """One in a hundred of healthy samples, and healthy sensors have no fault; seed 2."""
+    """The gate rejects one of a hundred healthy samples, and reports no fault; seed 2."""
     run = Run(paper, InitialState(0.3, 1.6, 'open', 0.5, -0.3), seed=2)
     run.estimator = Estimator(paper, EstimatorSettings(
         angle_noise=NOISE, disturbance_torque=1e-7, gate_probability=0.99))
@@ -507,7 +506,7 @@ def test_stuck_sensor_is_reported_at_once_and_excluded(sensor: int, mechanism: M
     run.after(250)
     run.plant.link_sensors.set_faults({LINK_NAMES[sensor]: Fault(LINK_NAMES[sensor], 'stuck')})
     run.after(48)
-    # Frozen at a sample that is far off it may be found at fault before, for that.
+    # A sensor frozen at a large error may be reported earlier for that error.
     assert 'repeats one value' not in run.estimator.sensor_faults().values()
     estimate = run.after(1)
     assert run.estimator.sensor_faults() == {LINK_NAMES[sensor]: 'repeats one value'}
@@ -530,7 +529,7 @@ def test_silent_sensor_is_reported_and_recovers(paper: Mechanism) -> None:
     run = Run(paper, InitialState(0.3, 1.6))
     run.after(50)
     for n, _ in enumerate(run.ticks(60, (0, 1, 3)), 1):
-        # After 0.2 s, fifty ticks.
+        # The fault is reported after 0.2 s, which is fifty ticks.
         assert run.estimator.sensor_faults() == ({'link_c': 'no data'} if n > 50 else {})
     run.after(1)
     assert run.estimator.sensor_faults() == {}
@@ -571,7 +570,7 @@ def test_without_a_gate_all_samples_are_accepted(paper: Mechanism) -> None:
     assert not run.estimator.gated
 
 
-# Late
+# Late samples
 
 HISTORY_MS = 100
 
@@ -597,7 +596,7 @@ class Delivered:
                 plant.advance(1, torques)
                 stamp_ns += PERIOD_NS // 8
                 if rng.random() < 0.15:
-                    # Now and then in two messages of one stamp.
+                    # Some stamps have two messages.
                     links = rng.permutation(4)
                     angles = plant.truth().link_angles[links] + NOISE * rng.standard_normal(4)
                     cut = int(rng.integers(1, 5))
@@ -605,7 +604,7 @@ class Delivered:
                         if links[part].size:
                             self.samples.append((stamp_ns, names_of(*links[part]), angles[part]))
             self.ticks.append((stamp_ns, (plant.sense_wheels() - before) / 4e-3))
-        # What would start the filter, whatever comes first.
+        # The first sample starts the filter in every order of arrival.
         start = FIRST_NS + PERIOD_NS // 16
         self.samples.insert(0, (start, names_of(0, 1, 2, 3), assemble(mechanism, 0.3, 1.6)))
 
@@ -631,14 +630,14 @@ def test_estimate_depends_on_what_arrived_and_not_on_when(
     seed: int, mechanism: Mechanism,
 ) -> None:
     """Each sample has its own delay of up to 0.1 s; only the set of arrived samples matters."""
-    told = Delivered(mechanism, seed)
+    motion = Delivered(mechanism, seed)
     rng = np.random.default_rng(seed + 100)
-    in_time = told.estimates(mechanism, np.zeros(len(told.samples)))
-    delays = rng.uniform(0.0, HISTORY_MS * 1e6, len(told.samples))
-    # The last ones arrive, all of them, with the last tick.
-    end_ns = told.ticks[-1][0]
-    delays = np.minimum(delays, [end_ns - stamp for stamp, *_ in told.samples])
-    late = told.estimates(mechanism, delays)
+    in_time = motion.estimates(mechanism, np.zeros(len(motion.samples)))
+    delays = rng.uniform(0.0, HISTORY_MS * 1e6, len(motion.samples))
+    # All late samples arrive by the last tick.
+    end_ns = motion.ticks[-1][0]
+    delays = np.minimum(delays, [end_ns - stamp for stamp, *_ in motion.samples])
+    late = motion.estimates(mechanism, delays)
     final, expected = late[-1], in_time[-1]
     assert final is not None
     assert expected is not None
@@ -646,7 +645,7 @@ def test_estimate_depends_on_what_arrived_and_not_on_when(
         np.testing.assert_allclose(
             getattr(final, name), getattr(expected, name), rtol=0.0, atol=1e-12,
             err_msg=f'{name}, seed {seed}')
-    # On the way there much was missing, so that the above is no matter of course.
+    # In the middle of the run samples are missing, so that the estimates differ there.
     middle = late[len(late) // 2], in_time[len(late) // 2]
     assert middle[0] is not None
     assert middle[1] is not None
@@ -655,7 +654,7 @@ def test_estimate_depends_on_what_arrived_and_not_on_when(
 
 @pytest.mark.parametrize('latency_ms', [1, 5, 40])
 def test_latency_causes_no_error_in_motion(latency_ms: int, mechanism: Mechanism) -> None:
-    """At 5 rad/s the sample of 5 ms ago is off by 25 mrad, ten times what is tolerated."""
+    """At 5 rad/s a sample of 5 ms ago differs by 25 mrad, ten times the tolerance."""
     run = Run(mechanism, InitialState(0.3, 1.6, 'open', 5.0, 5.0))
     rng = np.random.default_rng(7)
     waiting: list[tuple[int, Array]] = []
@@ -712,7 +711,7 @@ def test_start_from_a_late_sample_is_predicted_to_the_tick(mechanism: Mechanism)
     assert estimate is not None
     truth = run.plant.truth().link_angles
     moved = np.abs(truth - first).max()
-    # The encoders tell speeds half a period late: 1 - (9.5 / 10)^2 of ten periods from rest.
+    # The encoder speeds lag by half a period: 1 - (9.5 / 10)^2 of ten periods from rest.
     assert np.abs(run.unwrapped_error(estimate)).max() < 0.11 * moved
 
 
@@ -756,7 +755,7 @@ def test_small_bias_of_a_sensor_is_isolated(
     assert after < 2.0, f'seed {seed}'
     assert worst < np.radians(0.3), f'seed {seed}'
     assert list(run.estimator.sensor_faults()) == [LINK_NAMES[wrong]]
-    # It is used again when it is right again.
+    # The sensor is used again after its error ends.
     run.after(250)
     assert run.estimator.sensor_faults() == {}
     (estimate,) = run.ticks(1)
@@ -807,7 +806,7 @@ def test_biases_of_gyros_are_estimated(mechanism: Mechanism) -> None:
     run = Run(mechanism, InitialState(0.3, 1.6, 'open', 0.5, -0.3), GYROS)
     estimate = run.after(1000)
     assert list(estimate.gyro_biases) == [0, 1, 2, 3]
-    # A thousand samples of 5 mrad/s each, and a rate that is known as well.
+    # The tolerance is for a thousand samples with 5 mrad/s of noise and a known rate.
     np.testing.assert_allclose(
         list(estimate.gyro_biases.values()), [0.05, -0.03, 0.0, 0.1], rtol=0.0, atol=2e-3)
     assert (np.abs(run.error(estimate)[4:]) < SIGMAS * estimate.rate_sigmas).all()
@@ -854,7 +853,7 @@ def test_without_speeds_the_efforts_drive_the_prediction(source: str, paper: Mec
         assert run.estimator.driven_by == source
         worst = max(worst, float(np.abs(run.error(estimate)[4:]).max()))
     assert (estimate.rate_sigmas > 1.5 * sure).all()
-    # 5e-5 N m move a pair of links by 0.3 rad/s^2, a half turn of the sine by 0.05 rad/s.
+    # A torque of 5e-5 N m accelerates a pair of links by 0.3 rad/s^2, to 0.05 rad/s.
     assert worst < 0.02
     run.after(2)
     assert run.estimator.driven_by == 'wheel speeds'

@@ -1,14 +1,14 @@
 # Copyright 2026 The fourbar_ros authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The estimator imports filterpy's extended Kalman filter, and not what filterpy draws with."""
+"""The estimator imports filterpy's extended Kalman filter without plotting libraries."""
 
 import subprocess
 import sys
 
 import pytest
 
-# Loaded by the whole of filterpy, and not needed by the filter.
+# Modules that filterpy imports and the filter does not need.
 HEAVY = ('matplotlib', 'scipy.stats', 'scipy.optimize', 'scipy.ndimage')
 
 

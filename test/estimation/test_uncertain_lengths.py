@@ -66,7 +66,7 @@ class World:
         angles = assemble(linkage, 0.2, 0.2 + theta)
         gamma = gamma_matrix(angles, linkage.link_lengths)
         rates = np.concatenate([[0.0, rate], gamma @ [0.0, rate]])
-        # Links of a pair against each other, in both pairs.
+        # Opposite links of both pairs turn apart.
         other = np.sign(np.cos(theta))
         self.state = make_state(angles, rates + apart * np.array([-1.0, -other, 1.0, other]))
 
@@ -89,7 +89,7 @@ class World:
         return rates
 
     def move(self, torques: Array) -> Array:
-        """Pass a period, and return the mean speeds of the wheels (4,) [rad/s]."""
+        """Advance by a period, and return the mean speeds of the wheels (4,) [rad/s]."""
         before = self.wheels
         move_held(self.state, torques, 5e-4, 8, self.linkage.constants, NOTHING)
         return 0.5 * (before + self.wheels)
@@ -170,7 +170,7 @@ def test_compliant_joints_with_a_rigid_model(seed: int, rigid: Mechanism,
     estimates, _ = watch(world, estimator, 2.7, seed)
     assert estimator.starts == 1, f'seed {seed}'
     assert estimator.sensor_faults() == {}, f'seed {seed}'
-    # No worse than a few samples make it.
+    # The error is at most that of a few samples.
     errors = wrap_angles(estimates[-1].link_angles - world.angles)
     assert np.abs(errors).max() < 2.0 * NOISE, f'seed {seed}'
 
@@ -191,7 +191,7 @@ def test_rigid_joints(seed: int, theta: float, rate: float, seconds: float, rigi
 def test_start_near_a_change_point(seed: int, theta: float, miss: float, compliant: Mechanism
                                    ) -> None:
     """All four rates are unknown, and the links of a pair may rotate against each other."""
-    # At rest its joints hold it open, if it cannot close.
+    # The joints are open at rest if the loop cannot close.
     world = World(missing(compliant, 0.0, -miss if theta > 0.0 else miss, 0.0, 0.0), theta, 0.05)
     settled(world, compliant, 0.6, seed, settle=0.02)
 
@@ -271,9 +271,9 @@ def test_links_swing_as_those_of_the_plant(
         filtered.predict(PERIOD, linkage.flywheel_inertias * (world.wheels - before) / PERIOD)
         apart.append(world.angles[2] - world.angles[0])
         errors.append(wrap_angles(filtered.angles - world.angles))
-    # Joints swing at 155 rad/s, links against each other at up to 40: what is left out is of order
-    # four in their ratio, 0.004 of the square of the frequency. In half a second that makes
-    # 0.04 rad of 20.
+    # Joints oscillate at 155 rad/s, paired links at up to 40 rad/s. The neglected terms are of
+    # order four in the ratio, 0.004 of the squared frequency, which is 0.04 rad of 20 rad in half
+    # a second.
     assert np.abs(errors).max() < 0.04 * 0.5 * np.ptp(apart)
 
 

@@ -36,8 +36,8 @@ Array = NDArray[np.float64]
 Refuses = Callable[..., AbstractContextManager[None]]
 PAIRS = tuple(combinations(range(4), 2))
 
-# Angles up to 10 rad and lengths up to 0.5 m carry rounding of 2e-15 rad and 1e-16 m, an arc
-# cosine at most 1 / sin(FOLD) of its argument's; ratios of lengths reach 10. Hence 1e-12.
+# Angles up to 10 rad and lengths up to 0.5 m have rounding errors of 2e-15 rad and 1e-16 m. The
+# arc cosine amplifies by at most 1 / sin(FOLD), and ratios of lengths reach 10. Hence 1e-12.
 EXACT = 1e-12
 FOLD = 0.05
 
@@ -45,7 +45,7 @@ repeatable = settings(derandomize=True, deadline=None, max_examples=60)
 
 
 def linkage(lengths: tuple[float, ...]) -> Mechanism:
-    """Make a linkage of which only the lengths matter."""
+    """Make a linkage with given lengths; its other parameters have no effect."""
     middle = [[0.5 * length, 0.0] for length in lengths]
     return Mechanism(lengths, [0.02] * 4, [2e-5] * 4, middle, [3e-7] * 4)
 
@@ -69,7 +69,7 @@ def assembled(draw: st.DrawFn) -> tuple[Mechanism, Array, str]:
 
 
 def distance(first: Array, second: Array) -> float:
-    """Measure how far apart two sets of angles are, whole turns not counted [rad]."""
+    """Return the largest difference of two sets of angles without whole turns [rad]."""
     return float(np.abs((first - second + pi) % (2.0 * pi) - pi).max())
 
 
@@ -130,7 +130,7 @@ def test_both_solutions_of_a_pair_close(
 
 
 def away_from_fold(mechanism: Mechanism, angles: Array, pair: tuple[int, int]) -> bool:
-    """Tell whether the two other links are far enough from a line to be well determined."""
+    """Return whether the other two links are far enough from a line to be well determined."""
     k, m = (index for index in range(4) if index not in pair)
     lengths = mechanism.link_lengths
     sign = 1.0 if (k in (0, 3)) == (m in (0, 3)) else -1.0
@@ -185,7 +185,7 @@ def test_crossed_parallelogram_has_not() -> None:
 def test_branches_meet_where_the_parallelogram_is_folded(theta: float, branch: str) -> None:
     """There c and d lie on a line: both names give the one assembly."""
     angles = assemble(linkage((0.15, 0.08, 0.15, 0.08)), 0.4, 0.4 + theta, branch)
-    # An arc cosine at its end gives the root of its argument's rounding.
+    # The error of an arc cosine at its end is the square root of that of its argument.
     assert distance(angles[2:], angles[:2]) < 1e-7
 
 
@@ -307,7 +307,7 @@ def test_fold_is_one_up_to_a_small_angle(within: float, branch: str) -> None:
     assert branch_of([0.0, small, 1.0, 1.0 - small]) == branch
 
 
-# --- Which motions can be ---------------------------------------------------------------------
+# --- Possible motions -------------------------------------------------------------------------
 
 @given(case=assembled(), rates=st.tuples(*[st.floats(-5.0, 5.0)] * 2))
 @repeatable
