@@ -304,7 +304,7 @@ def test_closed_loop_moves_the_mechanism_by_torques_for_the_model(tmp_path: Path
     assert not any(same[armed + 2:])
 
 
-@pytest.mark.parametrize(('arguments', 'told'), [
+@pytest.mark.parametrize(('arguments', 'part'), [
     ([], '--closed-loop'),
     (['case.json', '--closed-loop', 'paper'], '--closed-loop'),
     (['case.json', '--seed', '1'], '--seed'),
@@ -319,7 +319,7 @@ def test_closed_loop_moves_the_mechanism_by_torques_for_the_model(tmp_path: Path
     (['--closed-loop', './late.yaml'], 'setpoints, entry 1 at 0.5 s, refused'),
 ])
 def test_impossible_closed_loop(
-    arguments: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str], part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The command prints one line and writes no file, also if the run ends early."""
@@ -333,5 +333,5 @@ def test_impossible_closed_loop(
     printed = capsys.readouterr()
     assert printed.out == ''
     assert len(printed.err.splitlines()) == 1
-    assert told in printed.err
+    assert part in printed.err
     assert sorted(tmp_path.iterdir()) == before

@@ -175,13 +175,13 @@ def test_refused_run_has_failed_with_the_reason() -> None:
     assert found.error == pytest.approx(radians(80.0), abs=crossing_runs.GOAL_TOLERANCE)
 
 
-Went = Callable[[Scenario, Any], Iterable[Any]]
+Runs = Callable[[Scenario, Any], Iterable[Any]]
 
 
 @pytest.fixture
-def went(monkeypatch: pytest.MonkeyPatch) -> Callable[[Went], CrossingOutcome]:
+def crossed(monkeypatch: pytest.MonkeyPatch) -> Callable[[Runs], CrossingOutcome]:
     """Return a function that replaces the run of a crossing and returns its outcome."""
-    def make(run_scenario: Went) -> CrossingOutcome:
+    def make(run_scenario: Runs) -> CrossingOutcome:
         monkeypatch.setattr(crossing_runs, 'run_scenario', run_scenario)
         return execute(CrossingRun(MANOEUVRES['motion'], 'four', 0))
     return make
@@ -197,11 +197,11 @@ def goal_of(scenario: Scenario) -> Array:
     return np.tile(scenario.setpoints[-1].positions, 2)
 
 
-def test_final_error_ignores_whole_turns(went: Callable[[Went], CrossingOutcome]) -> None:
+def test_final_error_ignores_whole_turns(crossed: Callable[[Runs], CrossingOutcome]) -> None:
     def turned(scenario: Scenario, loop: Any) -> Iterable[Any]:
         loop.supervisor.arming.arm(0, ())
         return [at(goal_of(scenario) + 2.0 * np.pi + 0.9 * crossing_runs.GOAL_TOLERANCE)]
-    found = went(turned)
+    found = crossed(turned)
     assert found.error == pytest.approx(0.9 * crossing_runs.GOAL_TOLERANCE)
     assert (found.passed, found.reason) == (True, '')
 
@@ -210,22 +210,22 @@ def test_final_error_ignores_whole_turns(went: Callable[[Went], CrossingOutcome]
     ([1.1, 0.0, 0.0, 0.0], True, 'elsewhere'), ([0.0, 0.0, -1.1, 0.0], True, 'elsewhere'),
     ([nan] * 4, True, 'elsewhere'), ([0.0] * 4, False, 'not armed since start')])
 def test_end_off_the_goal_or_disarmed_fails(
-    off: list[float], armed: bool, reason: str, went: Callable[[Went], CrossingOutcome],
+    off: list[float], armed: bool, reason: str, crossed: Callable[[Runs], CrossingOutcome],
 ) -> None:
     """Errors are in units of GOAL_TOLERANCE; NaN is off the goal."""
     def ended(scenario: Scenario, loop: Any) -> Iterable[Any]:
         if armed:
             loop.supervisor.arming.arm(0, ())
         return [at(goal_of(scenario) + crossing_runs.GOAL_TOLERANCE * np.array(off))]
-    found = went(ended)
+    found = crossed(ended)
     assert not found.passed
     assert found.reason == reason
 
 
-def test_run_that_fails_before_its_first_tick(went: Callable[[Went], CrossingOutcome]) -> None:
+def test_run_that_fails_before_its_first_tick(crossed: Callable[[Runs], CrossingOutcome]) -> None:
     def failed(scenario: Scenario, loop: Any) -> Iterable[Any]:
         raise FourbarError('the table is on fire')
-    found = went(failed)
+    found = crossed(failed)
     assert (found.passed, found.reason) == (False, 'the table is on fire')
     assert found.error == inf
     assert found.path.shape == (0, 2)
