@@ -64,6 +64,7 @@ def test_exit_code_is_that_of_the_checks(measured: tuple[int, dict[str, Any]]) -
     assert code == (0 if all(check['passed'] for check in document['checks']) else 1)
 
 
+@pytest.mark.slow
 def test_all_quantities_are_measured(measured: tuple[int, dict[str, Any]]) -> None:
     document = measured[1]
     for name in (*OURS, *(BESIDE_MUJOCO if find_spec('mujoco') else ())):
@@ -72,6 +73,7 @@ def test_all_quantities_are_measured(measured: tuple[int, dict[str, Any]]) -> No
         assert check['value'] == document[check['name']]
 
 
+@pytest.mark.slow
 def test_stretches_agree_with_their_names(measured: tuple[int, dict[str, Any]]) -> None:
     document = measured[1]
     assert document['near_alignment_largest_sine'] < 0.1 < 0.5 < document['smallest_sine']
@@ -80,6 +82,7 @@ def test_stretches_agree_with_their_names(measured: tuple[int, dict[str, Any]]) 
     assert document['control_step_p50_us'] <= document['control_step_p99_us']
 
 
+@pytest.mark.slow
 def test_error_of_the_motion_is_of_order_four(measured: tuple[int, dict[str, Any]]) -> None:
     """
     The error is of order four in h times the fastest rate.
@@ -89,6 +92,7 @@ def test_error_of_the_motion_is_of_order_four(measured: tuple[int, dict[str, Any
     assert measured[1]['error_rad'] < 4e-12
 
 
+@pytest.mark.slow
 @needs_mujoco
 def test_mujoco_error_is_that_of_rk4(measured: tuple[int, dict[str, Any]]) -> None:
     document = measured[1]

@@ -158,6 +158,7 @@ def test_second_demo_on_the_domain_is_refused_and_has_no_effect(both):
     assert not both['rival_output'].exists()
 
 
+@pytest.mark.slow
 def test_interrupt_during_the_motion_stops_everything(suite, tmp_path):
     demo = suite.start('demo', '--output', str(tmp_path / 'out'), fresh=True)
     wait_for(lambda: demo.popen.poll() is not None or 'Turning' in demo.stdout)
@@ -176,6 +177,7 @@ def test_interrupt_during_the_motion_stops_everything(suite, tmp_path):
         assert 'Traceback' not in path.read_text()
 
 
+@pytest.mark.slow
 def test_parts_end_with_a_demo_that_is_killed(suite, shared_memory, tmp_path):
     demo = suite.start('demo', '--output', str(tmp_path / 'out'), fresh=True)
     wait_for(lambda: set(children(demo)) == CHILDREN or demo.popen.poll() is not None)

@@ -263,6 +263,7 @@ def test_setpoint_with_bad_syntax_is_refused_without_ros(fourbar):
     assert "'link_b=up'" in line
 
 
+@pytest.mark.slow
 def test_commands_in_a_namespace(suite, make_probe, fourbar):
     # Two cores are too slow for two loops at full rate.
     suite.nodes('/lab', plant={'rate': 100.0}, controller={'setpoint_duration': 1.0})

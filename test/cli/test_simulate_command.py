@@ -70,7 +70,7 @@ def test_command_runs_as_a_process(tmp_path: Path) -> None:
     output = tmp_path / 'out.csv'
     done = subprocess.run(
         [sys.executable, '-m', 'fourbar_ros', 'simulate', str(CASES[0]), '-o', str(output)],
-        capture_output=True, text=True, timeout=120)
+        cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, 'branch: open from t = 0 s\n')
     assert len(read(output)[1]) == len(json.loads(CASES[0].read_text())['t'])
 
@@ -78,7 +78,7 @@ def test_command_runs_as_a_process(tmp_path: Path) -> None:
 def test_bad_input_ends_a_process_with_one_line(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, '-m', 'fourbar_ros', 'simulate', str(tmp_path / 'none.json'), '-o',
-         str(tmp_path / 'out.csv')], capture_output=True, text=True, timeout=120)
+         str(tmp_path / 'out.csv')], cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (2, '')
     assert len(done.stderr.splitlines()) == 1
     assert 'none.json' in done.stderr
@@ -267,7 +267,7 @@ def test_same_seed_gives_the_same_bytes_in_another_process(tmp_path: Path) -> No
     first, other = closed_loop(tmp_path / '1.csv'), tmp_path / '2.csv'
     done = subprocess.run(
         [sys.executable, '-m', 'fourbar_ros', *PAPER_SECOND, '-o', str(other)],
-        capture_output=True, text=True, timeout=120)
+        cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, '')
     assert first == other.read_bytes()
     assert first == closed_loop(tmp_path / '3.csv', '--seed', '0')

@@ -78,6 +78,7 @@ def test_validation_passes_its_checks_and_writes_its_files(
         assert row['motion'] in out
 
 
+@pytest.mark.slow
 def test_consistency_does_not_depend_on_the_number_of_processes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:

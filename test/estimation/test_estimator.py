@@ -121,6 +121,7 @@ def joint_encoders(heading: str) -> Table:
         REAL.link_sensors, kind='joint', heading=heading))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('heading', LINK_NAMES)
 def test_joint_encoders_and_a_heading_are_as_accurate(heading: str, mechanism: Mechanism) -> None:
     """Errors settle within their sigmas, for an absolute sensor on any link."""

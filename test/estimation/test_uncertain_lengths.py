@@ -150,6 +150,7 @@ def test_slow_passage(seed: int, aligned: float, miss: tuple[float, ...], compli
     assert np.sin(world.angles[1] - world.angles[0] - aligned) > 0.08
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', SEEDS)
 @pytest.mark.parametrize('aligned', [0.0, np.pi], ids=['0', 'pi'])
 @pytest.mark.parametrize('miss', [(3e-4, 0.0, 0.0, 0.0), (0.0, -3e-4, 0.0, 0.0)], ids=['a', 'b'])
@@ -185,6 +186,7 @@ def test_rigid_joints(seed: int, theta: float, rate: float, seconds: float, rigi
     assert world.angles[1] > world.angles[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', SEEDS)
 @pytest.mark.parametrize('theta', [-0.3, -0.1, 0.02, np.pi - 0.2])
 @pytest.mark.parametrize('miss', [0.0, 3e-4])
@@ -198,6 +200,7 @@ def test_start_near_a_change_point(seed: int, theta: float, miss: float, complia
 
 # What is known of lengths
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', SEEDS)
 @pytest.mark.parametrize(('miss', 'delta'), [
     ((3e-4, 0.0, 0.0, 0.0), -3e-4), ((0.0, 3e-4, 0.0, 0.0), 3e-4),

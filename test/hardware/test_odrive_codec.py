@@ -216,6 +216,7 @@ def test_state_and_faults_of_an_odrive(error, axis_state, state, faults):
     assert (report.sequence, report.boot) == (None, None)
 
 
+@pytest.mark.slow
 @repeatable
 @given(links, st.sampled_from(LinkState),
        st.frozensets(st.sampled_from(('driver', 'encoder', 'overspeed', 'undervoltage'))),

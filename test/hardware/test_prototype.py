@@ -39,6 +39,7 @@ def test_stamps_are_times_of_measurement(world) -> None:
             assert 4_000_000 < age_ns < 15_000_000
 
 
+@pytest.mark.slow
 def test_clocks_are_estimated(world) -> None:
     world.run(20.0)
     for link, drift in zip(world.prototype.links, (80e-6, -40e-6, 10e-6, -60e-6)):

@@ -50,6 +50,7 @@ def test_speeds_are_followed(world) -> None:
         world.wire.emulators[0].samples.truth.wheel_speeds, [20.0, -10.0, 5.0, 0.0], atol=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('kind', 'state'), [
     ('silent', DeviceState.DISARMED), ('low_battery', DeviceState.DISARMED)])
 def test_safety_rules_apply_with_odrives(world, kind, state) -> None:

@@ -109,11 +109,13 @@ def chosen(common, first):
     return common.run(NUMBA_CACHE_DIR=str(common.folder / 'chosen'))
 
 
+@pytest.mark.slow
 def test_second_process_loads_what_the_first_compiled(common, first):
     assert first['loaded'] == 0
     assert common.run()['loaded'] == 1
 
 
+@pytest.mark.slow
 def test_edited_callee_in_another_module_is_compiled(run, package):
     assert run()['scaled'] == 6.0
     callee = package / 'plant' / 'callee.py'

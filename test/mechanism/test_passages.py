@@ -287,6 +287,7 @@ def thousandth_passage(seed: int) -> tuple[Mechanism, Array]:
     return linkage, move_under_constant_torques(linkage, start, NONE, STEP, steps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('hundred', range(10))
 def test_a_thousand_passages_stay_on_the_branch(hundred: int) -> None:
     """States are finite and continuous, momentum is conserved, opposite links stay parallel."""
@@ -322,6 +323,7 @@ def fold(mismatch: float, change_point: float, rate: float, link: int) -> Case:
 FOLDS = [(1e-3, 0.0, 1.0, 0), (-1e-3, np.pi, -3.0, 1), (1e-4, np.pi, 0.3, 2), (-1e-4, 0.0, 3.0, 3)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('mismatch', 'change_point', 'rate', 'link'), [
     *FOLDS, (1e-5, 0.0, 1.0, 1), (1e-6, np.pi, -1.0, 0), (1e-7, 0.0, 0.3, 2)])
 def test_mismatch_folds_as_kane_equations_do(

@@ -69,6 +69,7 @@ def run_pytest(*arguments: str, environment: dict[str, str] | None = None
         cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.slow
 def test_collection_is_complete_beside_the_plugin(plugin: dict[str, str]) -> None:
     """Every test is collected."""
     alone = run_pytest('--collect-only')

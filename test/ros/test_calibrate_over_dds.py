@@ -146,6 +146,7 @@ def test_second_publisher_of_commands_is_refused(start, plant):
     assert plant.state() == 'disarmed'
 
 
+@pytest.mark.slow
 def test_missing_device_is_reported(start):
     process = start('encoders', '--pose', 'link_a=0', 'link_b=1', '--ros-args', '-r',
                     '__ns:=/elsewhere')

@@ -150,6 +150,7 @@ def test_rejected_answers_advance_time_until_the_command_timeout(nodes):
     assert count >= 25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('clock', ['fast', 'lockstep'])
 def test_clock_topic_is_monotonic_with_a_limited_rate(nodes, clock):
     """A late subscriber receives at most 200 messages per second, and time never decreases."""

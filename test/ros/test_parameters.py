@@ -239,6 +239,7 @@ def test_shipped_file_holds_the_tables():
     assert path.read_text() == yaml_text()
 
 
+@pytest.mark.slow
 def test_shipped_file_works_in_a_namespace(suite, make_probe):
     """All nodes without a bus start with the file, and take other values from a changed copy."""
     path = share_directory() / 'config' / 'nodes.yaml'

@@ -151,6 +151,7 @@ def watched(domain, shared_memory, tmp_path_factory, load_clock):
     return printed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('sim_time', [False, True], ids=['', 'sim_time'])
 @pytest.mark.parametrize('name', NAMES)
 def test_middleware_has_no_threads_at_the_end_of_a_process(watched, name, sim_time):

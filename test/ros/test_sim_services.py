@@ -176,6 +176,7 @@ def test_reset_to_an_impossible_state_is_refused_and_has_no_effect(testbed):
     assert testbed.received['sim/link_states'][-1].position == pytest.approx(before, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_command_line_has_the_same_effect_as_the_services(testbed, suite):
     def sim(action):
         process = suite.start('sim', action, '--ros-args', '-r',

@@ -112,6 +112,7 @@ def test_tick_is_sent_after_the_samples_that_belong_to_it(domain, nodes):
     assert all(sent['link_angles'][stamp] < sent['flywheel_states'][stamp] for stamp in common)
 
 
+@pytest.mark.slow
 def test_lost_ticks_are_counted_while_the_controller_is_stopped(nodes, testbed):
     def lost(message):
         return dict(zip(message.name, message.position))['lost']

@@ -102,6 +102,7 @@ def result() -> Result:
     return studied('prototype')
 
 
+@pytest.mark.slow
 def test_checks_pass(result: Result) -> None:
     assert [check.name for check in result.checks if not check.passed] == []
     # The time depends on the machine; `bench` has a limit for it.
@@ -150,6 +151,7 @@ def test_further_linkage_is_evaluated_on_both_branches(result: Result) -> None:
     assert 'conditioning_linkage.png' in result.files
 
 
+@pytest.mark.slow
 def test_without_a_mechanism_there_is_no_third_figure() -> None:
     assert not any('linkage' in name for name in studied().files)
     with pytest.raises(ConfigurationError):

@@ -298,6 +298,7 @@ def test_one_run_in_a_hundred_may_fail_and_not_more(
     assert len({check.name for check in result.checks}) == len(MANOEUVRES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('passes', 'runs'), [
     (easy, 60), (lambda run: False, 1), (lambda run: True, 300)], ids=['some', 'none', 'all'])
 def test_figure_is_complete(

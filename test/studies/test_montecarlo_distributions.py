@@ -52,6 +52,7 @@ def test_draws_follow_their_distribution(given: dict[str, Any], law: Any) -> Non
     assert found.pvalue > SIGNIFICANCE, f'seed {seed}'
 
 
+@pytest.mark.slow
 def test_choices_are_even_and_elements_and_parameters_independent() -> None:
     seed = 4
     made = campaign({

@@ -220,6 +220,7 @@ def test_folder_is_locked_by_one_process(
     os.close(descriptor)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures('small_batches')
 def test_full_disk_is_reported_and_finished_runs_are_stored(
     campaign_file: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,

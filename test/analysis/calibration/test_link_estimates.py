@@ -66,6 +66,7 @@ def test_reduced_inertias_are_found_to_one_percent(
         assert np.abs(values - wanted).max() < 0.3 * np.abs(before - wanted).max(), f'seed {seed}'
 
 
+@pytest.mark.slow
 def test_only_noise_is_left_where_nothing_else_moved_the_links(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]]) -> None:
     assert max(found.residual_ratio for of_one in estimates.values() for _, found in of_one) < 1.2

@@ -26,6 +26,7 @@ COULOMB, VISCOUS = 1e-3, 2e-6
 TOP, TORQUE, COAST = 80.0, 0.02, 6.0
 
 
+@pytest.mark.slow
 def test_truth_is_found_to_one_percent_and_covered(
         prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
     """
