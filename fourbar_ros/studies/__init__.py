@@ -189,7 +189,7 @@ def load_study(name: str, folder: Path | None = None, **options: Any
         options['folder'] = folder
     try:
         run: Callable[..., Result] = import_module(f'{__name__}.{name}').run
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise StudyError(f'{error.name} is missing: pip install fourbar_ros[analysis,hardware]',
                          name=error.name) from None
     return partial(run, **options)
