@@ -24,7 +24,7 @@ help:
 	@echo 'make install   build .venv and install the package into it'
 	@echo 'make demo      run the simulated testbed, closed loop'
 	@echo 'make test      run all tests but the slow ones (ARGS="-k closure" for a selection)'
-	@echo 'make test-quick  run the tests that start no process'
+	@echo 'make test-quick  run the quick tests, which start no node'
 	@echo 'make test-long   run the slow tests: campaigns, studies, long runs'
 	@echo 'make bench     time the mechanics beside MuJoCo, numbers in bench.json'
 	@echo 'make lint      check style and types'
@@ -47,7 +47,7 @@ test: $(INSTALLED)
 	@$(PYTEST) $(if $(ARGS),$(ARGS),$(WORKERS) -m 'not slow')
 
 test-quick: $(INSTALLED)
-	@$(PYTEST) $(WORKERS) -m 'not (slow or node or package)' $(ARGS)
+	@$(PYTEST) $(WORKERS) -m 'not (medium or slow or node or package)' $(ARGS)
 
 test-long: $(INSTALLED)
 	@$(PYTEST) $(WORKERS) -m slow $(ARGS)

@@ -86,6 +86,7 @@ def dependencies():
     return {element.text for element in manifest.findall('exec_depend')}
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('path', SOURCES, ids=[str(path.relative_to(ROOT)) for path in SOURCES])
 def test_file_has_copyright_header_and_docstring(path):
     lines = path.read_text().splitlines()
@@ -95,6 +96,7 @@ def test_file_has_copyright_header_and_docstring(path):
     assert ast.get_docstring(ast.parse(path.read_text()))
 
 
+@pytest.mark.medium
 @each_module
 def test_rooms_import_one_way(path):
     room = room_of(path)
@@ -102,6 +104,7 @@ def test_rooms_import_one_way(path):
     assert (rooms & set(MAY_IMPORT)) - {room} <= set(MAY_IMPORT[room])
 
 
+@pytest.mark.medium
 def test_imports_have_no_cycles():
     """The graph of files includes imports inside functions and for type checking."""
     names = {path: '.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__')
@@ -131,6 +134,7 @@ def test_ros_packages_are_declared(path):
     assert ros_packages(path) <= dependencies()
 
 
+@pytest.mark.medium
 @each_module
 def test_kernels_are_compiled_in_one_place_and_from_hashed_sources(path):
     """The cache of the kernels is valid only if its fingerprint covers all sources."""

@@ -90,6 +90,7 @@ def test_namespace_chooses_a_suite(recording_of, namespace):
     assert recording.joint_states('reference').topic == '/two/reference'
 
 
+@pytest.mark.medium
 def test_status_values(motion_bag, refuses):
     recording = read_bag(motion_bag)
     assert recording.statuses('device_status')[0]['mechanism'] == 'paper'
@@ -130,6 +131,7 @@ def test_error_for_a_bag_of_a_killed_recorder_has_the_repair(synthetic, refused,
     refused(bag, 'no_metadata', repair=f'ros2 bag reindex -s mcap {bag}')
 
 
+@pytest.mark.medium
 def test_bag_cut_anywhere_is_refused(synthetic, refused, tmp_path):
     bag = synthetic.write_bag(tmp_path / 'bag', {'/reference': [
         (row, synthetic.joint_state(row, LINKS, [1.0] * 4)) for row in range(5000)]})

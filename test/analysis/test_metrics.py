@@ -109,6 +109,7 @@ def test_loop(result, motion_bag):
     assert loop['round_trip_max_ms'] == trips[-1]
 
 
+@pytest.mark.medium
 def test_namespace_and_recorder_time_have_no_effect(synthetic, tmp_path, result):
     messages = synthetic.motion_messages(namespace='/lab')
     for entries in messages.values():
@@ -117,6 +118,7 @@ def test_namespace_and_recorder_time_have_no_effect(synthetic, tmp_path, result)
     assert other == result
 
 
+@pytest.mark.medium
 def test_whole_turns_between_topics_have_no_effect(motion_with, result):
     def turn(messages):
         for number, name in ((1, '/estimate/link_states'), (-2, '/reference')):
@@ -127,6 +129,7 @@ def test_whole_turns_between_topics_have_no_effect(motion_with, result):
         assert turned[group] == pytest.approx(result[group], rel=1e-9)
 
 
+@pytest.mark.medium
 def test_late_recorder_does_not_shift_the_start(motion_with, synthetic):
     def delay(messages):
         received_ns, setpoint = messages['/setpoint'][0]
@@ -145,6 +148,7 @@ def test_refused_setpoint_is_not_the_begin_of_the_motion(motion_with, synthetic)
     assert motion.start_ns == synthetic.START_NS
 
 
+@pytest.mark.medium
 def test_goal_of_a_link_without_setpoint_is_its_reference(motion_with, synthetic):
     def hold(messages):
         received_ns, _ = messages['/setpoint'][0]
@@ -156,6 +160,7 @@ def test_goal_of_a_link_without_setpoint_is_its_reference(motion_with, synthetic
     assert goal[:2] == pytest.approx([synthetic.TURN_RAD, 1.25])
 
 
+@pytest.mark.medium
 def test_setpoint_at_the_present_angles(motion_with, synthetic):
     def rest(messages):
         received_ns, _ = messages['/setpoint'][0]
@@ -168,6 +173,7 @@ def test_setpoint_at_the_present_angles(motion_with, synthetic):
     assert motion.start_ns == synthetic.START_NS
 
 
+@pytest.mark.medium
 def test_disarming_ends_the_motion(motion_with, synthetic):
     disarmed_ns = synthetic.START_NS + 11_500_000_000
 
@@ -179,6 +185,7 @@ def test_disarming_ends_the_motion(motion_with, synthetic):
     assert find_manoeuvre(motion_with(disarm)).end_ns == disarmed_ns
 
 
+@pytest.mark.medium
 def test_recording_that_ends_early_has_no_final_error(motion_with, synthetic):
     def cut(messages):
         for name, entries in messages.items():
@@ -189,6 +196,7 @@ def test_recording_that_ends_early_has_no_final_error(motion_with, synthetic):
     assert result['tracking']['rms_rad'] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('topic', 'lost'), [
     ('sim/link_states', {'tracking.rms_rad', 'tracking.peak_rad', 'tracking.final_error_rad',
                          'estimate.rms_error_rad', 'estimate.peak_error_rad',
@@ -212,6 +220,7 @@ def test_missing_optional_topic_removes_its_metrics_only(motion_with, result, to
         assert poorer[group][key] == result[group][key]
 
 
+@pytest.mark.medium
 def test_recording_without_copper_losses_has_all_other_metrics(motion_with, result):
     def older(messages):
         for _, message in messages['/energy']:
@@ -222,6 +231,7 @@ def test_recording_without_copper_losses_has_all_other_metrics(motion_with, resu
     assert poorer['energy']['work_j'] == result['energy']['work_j']
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     'topic', ['setpoint', 'reference', 'estimate/link_states', 'flywheel_states'])
 def test_missing_essential_topic_is_named(motion_with, refuses, topic):
@@ -231,6 +241,7 @@ def test_missing_essential_topic_is_named(motion_with, refuses, topic):
         compute_metrics(motion_with(leave_out), PAPER)
 
 
+@pytest.mark.medium
 def test_setpoint_without_response_is_an_error(motion_with, synthetic, refuses):
     rng = np.random.default_rng(3)
 
@@ -241,6 +252,7 @@ def test_setpoint_without_response_is_an_error(motion_with, synthetic, refuses):
         compute_metrics(motion_with(disarmed), PAPER)
 
 
+@pytest.mark.medium
 def test_ticks_that_the_recorder_missed_are_counted(motion_with):
     def thin(messages):
         del messages['/timing'][300:303]

@@ -35,6 +35,7 @@ def figures(page):
         r'<section id="(\w+)"><h2>[^<]*</h2><figure>(<svg.*?</svg>)', page, re.DOTALL)}
 
 
+@pytest.mark.slow
 def test_page_and_json_have_the_same_numbers(written):
     result, page, text = written
     assert json.loads(text) == result
@@ -149,6 +150,7 @@ def test_missing_data_is_named_in_the_page(synthetic, tmp_path, topics, absent):
     assert set(re.findall(r'<section id="(\w+)"><h2>[^<]*</h2><p class="absent">', page)) == absent
 
 
+@pytest.mark.slow
 def test_motion_backwards_short_and_cut(synthetic, tmp_path):
     messages = synthetic.motion_messages()
     for name, entries in messages.items():
@@ -162,6 +164,7 @@ def test_motion_backwards_short_and_cut(synthetic, tmp_path):
     assert list(figures((tmp_path / 'r.html').read_text())) == NAMES
 
 
+@pytest.mark.slow
 def test_unknown_mechanism_of_the_bag_is_ignored_and_of_the_caller_refused(synthetic, tmp_path):
     bag = synthetic.write_bag(
         tmp_path / 'bag', synthetic.motion_messages(mechanism='/gone/my.yaml'))
@@ -171,6 +174,7 @@ def test_unknown_mechanism_of_the_bag_is_ignored_and_of_the_caller_refused(synth
         report.write_report(bag, *files, 'nowhere')
 
 
+@pytest.mark.slow
 def test_output_that_cannot_be_written_is_an_error(motion_bag, tmp_path):
     with pytest.raises(OutputError):
         report.write_report(motion_bag, tmp_path / 'no' / 'r.html', tmp_path / 'm.json', PAPER)

@@ -103,6 +103,7 @@ def test_mujoco_error_is_that_of_rk4(measured: tuple[int, dict[str, Any]]) -> No
             document[f'mujoco_{name}_step_ns'] / document['rk4_step_ns'])
 
 
+@pytest.mark.slow
 def test_without_mujoco_the_rest_is_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:

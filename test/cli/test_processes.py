@@ -133,6 +133,7 @@ def test_single_child_can_be_stopped_before_the_others(stage: Stage) -> None:
         assert ('two', 'SIGINT') not in stage.events()
 
 
+@pytest.mark.medium
 def test_child_that_ignores_signals_is_killed(stage: Stage) -> None:
     with Processes(stage.folder, os.environ) as children:
         children.start('deaf')

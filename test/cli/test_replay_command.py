@@ -33,6 +33,7 @@ def bag(recorded, tmp_path, monkeypatch):
     return 'run1'
 
 
+@pytest.mark.slow
 def test_all_files_are_beside_the_bag(bag, capsys):
     assert main(['replay', bag, '--json', 'numbers.json']) == 0
     output, errors = capsys.readouterr()
@@ -51,6 +52,7 @@ def test_all_files_are_beside_the_bag(bag, capsys):
     assert len(read_bag(new).joint_states('estimate/link_states')) > 250
 
 
+@pytest.mark.medium
 def test_used_settings_are_printed(bag, capsys):
     assert main(['replay', bag, '-o', 'new', '--angle-noise', '0.004',
                  '--counts-per-turn', '4096', '--gate-probability', '1']) == 0
@@ -66,6 +68,7 @@ def test_used_settings_are_printed(bag, capsys):
                         'closure_tolerance': 0.0}
 
 
+@pytest.mark.medium
 def test_parameters_file_is_read_and_options_override_it(bag):
     text = (share_directory() / 'config' / 'nodes.yaml').read_text()
     Path('nodes.yaml').write_text(

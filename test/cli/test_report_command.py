@@ -24,6 +24,7 @@ def report(*arguments, cwd):
         capture_output=True, text=True, timeout=120)
 
 
+@pytest.mark.slow
 def test_files_are_beside_the_bag(bag):
     done = report('run1', cwd=bag.parent)
     assert (done.returncode, done.stderr) == (0, '')
@@ -35,6 +36,7 @@ def test_files_are_beside_the_bag(bag):
     assert not list(bag.glob('*.html'))
 
 
+@pytest.mark.medium
 def test_files_are_written_to_the_given_paths(bag, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(['report', str(bag), '-o', 'a.html', '--metrics', 'b.json',
@@ -42,6 +44,7 @@ def test_files_are_written_to_the_given_paths(bag, tmp_path, monkeypatch):
     assert sorted(path.name for path in tmp_path.iterdir()) == ['a.html', 'b.json']
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('arguments', 'named'), [
     (['nowhere'], 'nowhere: '),
     (['.'], 'metadata.yaml'),
@@ -60,6 +63,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert out == ''
 
 
+@pytest.mark.medium
 def test_bad_input_ends_a_process_with_one_line(tmp_path):
     done = report('nowhere', cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, '')

@@ -39,6 +39,7 @@ def test_bad_syntax_is_refused_with_an_example(text: str) -> None:
     assert 'link_a=30deg' in str(caught.value)
 
 
+@pytest.mark.medium
 @settings(derandomize=True)
 @given(angle=st.floats(allow_nan=False, allow_infinity=False))
 def test_every_number_is_read_back_from_its_text(angle: float) -> None:

@@ -66,6 +66,7 @@ def test_numbers_have_twelve_significant_digits(case: Path, tmp_path: Path) -> N
     np.testing.assert_allclose(read(output)[1], exact, rtol=0.5e-11, atol=0.0)
 
 
+@pytest.mark.medium
 def test_command_runs_as_a_process(tmp_path: Path) -> None:
     output = tmp_path / 'out.csv'
     done = subprocess.run(
@@ -75,6 +76,7 @@ def test_command_runs_as_a_process(tmp_path: Path) -> None:
     assert len(read(output)[1]) == len(json.loads(CASES[0].read_text())['t'])
 
 
+@pytest.mark.medium
 def test_bad_input_ends_a_process_with_one_line(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, '-m', 'fourbar_ros', 'simulate', str(tmp_path / 'none.json'), '-o',
@@ -263,6 +265,7 @@ def closed_loop(output: Path, *arguments: str) -> bytes:
     return output.read_bytes()
 
 
+@pytest.mark.medium
 def test_same_seed_gives_the_same_bytes_in_another_process(tmp_path: Path) -> None:
     first, other = closed_loop(tmp_path / '1.csv'), tmp_path / '2.csv'
     done = subprocess.run(
@@ -274,6 +277,7 @@ def test_same_seed_gives_the_same_bytes_in_another_process(tmp_path: Path) -> No
     assert first != closed_loop(tmp_path / '4.csv', '--seed', '1')
 
 
+@pytest.mark.medium
 def test_closed_loop_table_is_the_recorded_run(tmp_path: Path) -> None:
     output = tmp_path / 'out.csv'
     assert main(['simulate', '--closed-loop', 'prototype', '--duration', '0.5', '-o',

@@ -249,6 +249,7 @@ def quarter_turn(mechanism: Mechanism, name: str) -> tuple[float, float, Array]:
     return peak, energy, half
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(('name', 'speed', 'energy'), [
     ('min_norm', 62.37, 2.6452e-3), ('min_energy', 62.37, 2.6452e-3),
     ('bounded', 62.37, 2.6452e-3), ('min_max_speed', 62.37, 2.6452e-3),
@@ -260,6 +261,7 @@ def test_quarter_turn_of_the_paper(name: str, speed: float, energy: float, paper
         pytest.approx(speed, abs=0.005), pytest.approx(energy, abs=5e-8))
 
 
+@pytest.mark.medium
 def test_least_energy_keeps_the_speeds_of_unequal_wheels_equal(paper: Mechanism) -> None:
     """The energy is the least one of a pair: momentum squared over twice the inertia."""
     uneven_wheels = replace(
@@ -436,6 +438,7 @@ def lipschitz(problem: Problem) -> float:
     return float(steepest * (1.0 + most / (least - MARGIN * most)))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('seed', range(10))
 def test_torques_follow_the_demand_without_jumps(seed: int, draw: Draw) -> None:
     problem = draw(seed)
@@ -518,6 +521,7 @@ def test_directions_are_orthonormal_and_wheels_act_on_each_alone(seed: int, draw
         rtol=1e-12)
 
 
+@pytest.mark.medium
 def test_demand_is_reduced_before_torques_grow() -> None:
     """
     Wheels b and c drive both axes until wheel c has no leverage on axis a.

@@ -48,6 +48,7 @@ def go(driven: Any, names: Sequence[str], positions: Sequence[float]) -> None:
     assert driven.controller.mode == 'hold'
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('names', [ALL, ('link_a', 'link_c'), ('link_b', 'link_d')])
 def test_out_on_the_folded_branch_and_back(names: Sequence[str], drive: Drive) -> None:
     """Two named links suffice if they determine the branch."""
@@ -67,6 +68,7 @@ def test_out_on_the_folded_branch_and_back(names: Sequence[str], drive: Drive) -
     np.testing.assert_allclose(driven.angles, [0.2, 0.5, 0.2, 0.5], atol=1e-12)
 
 
+@pytest.mark.medium
 def test_round_through_all_three_branches(drive: Drive) -> None:
     """The way is parallelogram, folded, crossed and back through the change points."""
     driven = standing(drive, 0.0, change_points='choose', setpoint_duration=4.0)

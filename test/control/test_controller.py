@@ -148,6 +148,7 @@ def test_reference_rates_are_the_derivative_on_all_four_links(
     np.testing.assert_allclose(slopes, rates[1:-1], atol=2 * 60 * 0.4 / 8 * PERIOD ** 2 / 6 * 2)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('after', [1, 300, 1250, 2400])
 def test_replanning_takes_over_angle_rate_and_acceleration(after: int, drive: Drive) -> None:
     """One tick after the new setpoint the reference hardly differs from the old one."""
@@ -174,6 +175,7 @@ def test_replanning_takes_over_angle_rate_and_acceleration(after: int, drive: Dr
     np.testing.assert_allclose(control.reference_angles[:2], [-0.5, pi / 3 - 0.5], atol=1e-12)
 
 
+@pytest.mark.medium
 def test_refused_setpoint_does_not_disturb_the_move(drive: Drive) -> None:
     alone, bothered = drive(), drive()
     for driven in (alone, bothered):
@@ -258,6 +260,7 @@ def test_at_a_change_point_off_the_parallelogram_the_wheels_coast(name: str) -> 
         assert not control.command.by_speed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('command', ['effort', 'velocity'])
 @pytest.mark.parametrize('theta', [0.0, 1e-3, -0.02, pi, pi - 0.03])
 def test_controller_holds_at_a_change_point_of_the_parallelogram(
@@ -432,6 +435,7 @@ STEPS: dict[str, Callable[[Any], None]] = {
         ['link_a', 'link_b'], [0.5, pi / 3 + 0.3])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('command', ['effort', 'velocity'])
 @pytest.mark.parametrize('second', [*STEPS])
 @pytest.mark.parametrize('first', [*STEPS])
@@ -469,6 +473,7 @@ def test_change_of_mode_causes_no_large_torque_step(
     assert steered.controller.problem == ''
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('act', ['setpoint', 'trajectory'])
 def test_setpoint_while_damping_starts_from_the_moving_links(act: str, moving: Any) -> None:
     controller = moving.controller
@@ -719,6 +724,7 @@ def test_shortest_timing_has_the_shortest_feasible_duration(
     np.testing.assert_allclose(steered.plant.truth().link_angles[:2], goal, atol=1e-5)
 
 
+@pytest.mark.medium
 def test_trajectory_passes_its_points_in_time(drive: Drive) -> None:
     driven = drive()
     points = [Point([0.1, pi / 3 + 0.05], 4.0), Point([0.1, pi / 3 - 0.05], 8.0),
@@ -767,6 +773,7 @@ def test_trajectory_with_a_foreign_stamp_is_refused(
             ['link_a'], [Point([0.1], 5.0)], driven.stamp_ns + round(offset_s * 1e9))
 
 
+@pytest.mark.medium
 def test_change_points_need_the_setting_keep(drive: Drive, refuses: Refuses) -> None:
     """The goals are beyond theta = 0 and on it."""
     for goal in (-0.3, 0.0):

@@ -128,6 +128,7 @@ WAYS = [
 ]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(('linkage', 'segment'), WAYS)
 @pytest.mark.parametrize('usable', [(0, 1, 2, 3), (0, 1), (0, 1, 3), (1, 2)])
 def test_motion_and_wheel_speeds_of_the_plant_under_the_torques(

@@ -153,6 +153,7 @@ def peak_speed(mechanism: Mechanism, name: str, travel: tuple[float, float]) -> 
 TRAVELS = [(pi / 2, pi / 2), (0.5, -0.3), (-0.4, 0.8)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('travel', TRAVELS)
 @pytest.mark.parametrize('linkage', ['uneven', 'parallelogram', 'unequal_wheels'])
 def test_no_other_rule_has_a_smaller_peak_speed_from_rest(
@@ -175,6 +176,7 @@ def unequal_wheels(paper: Mechanism) -> Mechanism:
         paper, flywheel_inertias=paper.flywheel_inertias * np.array([1.0, 2.0, 3.0, 0.5]))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('seed', range(10))
 def test_torques_follow_speeds_and_demand_without_jumps(seed: int, uneven: Mechanism) -> None:
     """

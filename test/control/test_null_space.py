@@ -220,6 +220,7 @@ def test_unknown_target_is_refused(refuses: Refuses) -> None:
         assert target_speeds(name, np.zeros(4), 1.0).shape == (4,)
 
 
+@pytest.mark.medium
 def test_null_torques_are_finite_for_any_input() -> None:
     """Cases: dependent rows, no wheels, empty bounds; seed 7."""
     rng = np.random.default_rng(7)

@@ -238,6 +238,7 @@ def side_of_joint_3(angles: Array) -> float:
     return float(np.sign(np.sin(angles[3] - angles[2])))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('pair', PAIRS, ids=lambda pair: '-'.join(names_of(*pair)))
 def test_accepted_goal_has_the_named_angles(pair: tuple[int, int], drive: Drive) -> None:
     """For any linkage and pose the goal has both named angles, and the loop closes."""

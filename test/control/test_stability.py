@@ -77,6 +77,7 @@ def simulate(bandwidth: float, damping: float, period: float, by_speed: bool, er
             rate += acceleration * h
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('by_speed', [False, True])
 @pytest.mark.parametrize('seed', SEEDS)
 def test_errors_of_the_simulated_loop_decay_at_the_predicted_rate(

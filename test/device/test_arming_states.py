@@ -97,6 +97,7 @@ def test_reset_always_succeeds_and_names_the_released_parts(state: DeviceState) 
     assert state.value in message
 
 
+@pytest.mark.medium
 @settings(max_examples=300, derandomize=True)
 @given(events=st.lists(st.sampled_from(sorted(EVENTS)), max_size=30))
 def test_only_a_reset_and_then_arm_lead_from_a_latched_state_to_armed(events: list[str]) -> None:

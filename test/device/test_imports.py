@@ -13,6 +13,7 @@ LIST_PLANT_MODULES = (
     'print(*(name for name in sys.modules if name.startswith("fourbar_ros.plant")))')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('module', 'loads_plant'), [
     ('fourbar_ros.device', False), ('fourbar_ros.hardware.prototype', False),
     ('fourbar_ros.hardware.emulator', True)])

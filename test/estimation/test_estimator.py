@@ -99,6 +99,7 @@ def test_errors_settle_within_their_sigmas(mechanism: Mechanism, branch: str) ->
     assert np.abs(run.error(estimate)[4:]).max() < 0.02
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('direction', [1.0, -1.0])
 def test_estimate_is_continuous_over_many_turns(mechanism: Mechanism, direction: float) -> None:
     """The whole spins at 12 rad/s: every link passes the cut at pi eleven times in 6 s."""
@@ -450,6 +451,7 @@ def test_lost_filter_recovers(jump: float, paper: Mechanism) -> None:
     assert run.estimator.starts <= 2
 
 
+@pytest.mark.medium
 def test_noise_alone_does_not_restart_the_filter(paper: Mechanism) -> None:
     run = Run(paper, InitialState(0.0, 1.0, 'open', 0.3, 0.1), seed=4)
     run.after(2000)
@@ -466,6 +468,7 @@ def measured_with(run: Run, offsets: Array) -> Estimate:
     return estimate
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('sensor', range(4))
 @pytest.mark.parametrize('offset', [0.05, -0.5, 3.0])
 def test_wrong_sensor_is_gated_until_it_agrees_again(
@@ -487,6 +490,7 @@ def test_wrong_sensor_is_gated_until_it_agrees_again(
     assert run.estimator.starts == 1
 
 
+@pytest.mark.medium
 def test_gate_rejects_the_fraction_of_its_probability(paper: Mechanism) -> None:
     """The gate rejects one of a hundred healthy samples, and reports no fault; seed 2."""
     run = Run(paper, InitialState(0.3, 1.6, 'open', 0.5, -0.3), seed=2)
@@ -500,6 +504,7 @@ def test_gate_rejects_the_fraction_of_its_probability(paper: Mechanism) -> None:
     assert abs(run.estimator.gated.total() - before - 80) < 36
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('sensor', range(4))
 def test_stuck_sensor_is_reported_at_once_and_excluded(sensor: int, mechanism: Mechanism) -> None:
     """Also at rest, where its frozen sample fits better than any other."""
@@ -536,6 +541,7 @@ def test_silent_sensor_is_reported_and_recovers(paper: Mechanism) -> None:
     assert run.estimator.sensor_faults() == {}
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('garbage', [False, True])
 def test_estimate_is_lost_a_second_after_the_last_accepted_sample(
     garbage: bool, paper: Mechanism,
@@ -626,6 +632,7 @@ class Delivered:
         return estimates
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', range(8))
 def test_estimate_depends_on_what_arrived_and_not_on_when(
     seed: int, mechanism: Mechanism,
@@ -653,6 +660,7 @@ def test_estimate_depends_on_what_arrived_and_not_on_when(
     assert not np.allclose(middle[0].link_angles, middle[1].link_angles, rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('latency_ms', [1, 5, 40])
 def test_latency_causes_no_error_in_motion(latency_ms: int, mechanism: Mechanism) -> None:
     """At 5 rad/s a sample of 5 ms ago differs by 25 mrad, ten times the tolerance."""
@@ -763,6 +771,7 @@ def test_small_bias_of_a_sensor_is_isolated(
     assert estimate.innovation is not None and estimate.innovation.degrees_of_freedom == 4
 
 
+@pytest.mark.medium
 def test_both_sensors_are_suspected_where_neither_can_be_isolated(paper: Mechanism) -> None:
     """
     Sensors of paired links have opposite offsets from the start.
@@ -803,6 +812,7 @@ GYROS = replace(REAL, link_sensors=replace(
     REAL.link_sensors, gyro=True, gyro_noise_rms=5e-3, gyro_bias=(0.05, -0.03, 0.0, 0.1)))
 
 
+@pytest.mark.medium
 def test_biases_of_gyros_are_estimated(mechanism: Mechanism) -> None:
     run = Run(mechanism, InitialState(0.3, 1.6, 'open', 0.5, -0.3), GYROS)
     estimate = run.after(1000)
@@ -886,6 +896,7 @@ def test_unusable_commands_are_ignored(efforts: list[float], running: Run) -> No
 
 # Disturbances
 
+@pytest.mark.medium
 def test_constant_torques_are_estimated(paper: Mechanism) -> None:
     """A torque on link c acts as one on its paired link a."""
     estimator = Estimator(paper, EstimatorSettings(disturbance_walk=3e-7))

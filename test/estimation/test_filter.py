@@ -180,6 +180,7 @@ def chi_square_mean(freedom: int, count: int) -> tuple[float, float]:
     return low / count, high / count
 
 
+@pytest.mark.medium
 def test_nis_is_chi_square_of_four(consistency: Consistency) -> None:
     low, high = chi_square_mean(4, RUNS * TICKS)
     assert low < consistency.nis.mean() < high
@@ -337,6 +338,7 @@ def test_filter_is_a_filterpy_filter(paper: Mechanism) -> None:
     assert isinstance(linkage, ExtendedKalmanFilter)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('sensors', SEEN, ids=str)
 @pytest.mark.parametrize('kind', ['paper', 'uneven', 'random'])
 @pytest.mark.parametrize('seed', range(5))

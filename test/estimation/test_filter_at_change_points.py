@@ -101,6 +101,7 @@ def settled(estimator: Estimator, moments: Iterator[Moment], seed: int) -> list[
     return everything
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('seed', SEEDS)
 @pytest.mark.parametrize('aligned', [0.0, np.pi], ids=['0', 'pi'])
 @pytest.mark.parametrize(('before', 'rate'), [(-0.4, 0.6), (-0.06, 0.02), (0.4, -2.0)])
@@ -115,6 +116,7 @@ def test_passage(seed: int, aligned: float, before: float, rate: float, mechanis
     np.testing.assert_allclose(wrap_angles(last.angles[2] - last.angles[0]), 0.0, atol=1e-6)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('seed', SEEDS)
 def test_folding_at_a_change_point_is_followed(seed: int, mechanism: Mechanism) -> None:
     """Opposite torques on opposite wheels turn it onto the branch on which b stays on a."""
@@ -125,6 +127,7 @@ def test_folding_at_a_change_point_is_followed(seed: int, mechanism: Mechanism) 
     assert abs(end.angles[2] - end.angles[0]) > 0.4
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('seed', SEEDS)
 @pytest.mark.parametrize('theta', [0.0, 0.002, 0.05, np.pi - 0.01])
 def test_start_at_or_near_a_change_point(seed: int, theta: float, mechanism: Mechanism) -> None:

@@ -19,6 +19,7 @@ def run(code: str) -> list[str]:
     ).stdout.split()
 
 
+@pytest.mark.medium
 def test_import_of_the_estimator_loads_no_plotting_and_no_statistics() -> None:
     loaded = run('import fourbar_ros.estimation, sys; print(*sys.modules)')
     assert 'filterpy.kalman.EKF' in loaded
@@ -42,6 +43,7 @@ def test_later_import_of_filterpy_is_complete() -> None:
     assert after[0] == after[2] == after[3] == 'True'
 
 
+@pytest.mark.slow
 def test_log_likelihood_is_that_of_filterpy() -> None:
     """The density behind it is imported on first use."""
     code = (

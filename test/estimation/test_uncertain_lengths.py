@@ -138,6 +138,7 @@ def settled(world: World, known: Mechanism, seconds: float, seed: int, torque: f
 
 # Passages
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', SEEDS)
 @pytest.mark.parametrize('aligned', [0.0, np.pi], ids=['0', 'pi'])
 @pytest.mark.parametrize('miss', [(1e-4, 0.0, 0.0, 0.0), (0.0, -1e-4, 0.0, 0.0), (0.0,) * 4],
@@ -162,6 +163,7 @@ def test_turning_off_at_a_change_point(seed: int, aligned: float, miss: tuple[fl
     assert abs(np.sin(world.angles[2] - world.angles[0])) > 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', SEEDS)
 def test_compliant_joints_with_a_rigid_model(seed: int, rigid: Mechanism,
                                              compliant: Mechanism) -> None:
@@ -176,6 +178,7 @@ def test_compliant_joints_with_a_rigid_model(seed: int, rigid: Mechanism,
     assert np.abs(errors).max() < 2.0 * NOISE, f'seed {seed}'
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('seed', SEEDS)
 @pytest.mark.parametrize(('theta', 'rate', 'seconds'), [(-0.4, 0.2, 4.0), (-0.06, 0.02, 6.0)])
 def test_rigid_joints(seed: int, theta: float, rate: float, seconds: float, rigid: Mechanism
@@ -224,6 +227,7 @@ def test_length_mismatch_is_estimated_before_a_change_point(
     assert sigma < 0.1 * TOLERANCE
 
 
+@pytest.mark.medium
 def test_wrong_lengths_leave_no_error_away_from_change_points(rigid: Mechanism) -> None:
     """Without tolerance the errors of links c and d are many sigmas."""
     far = []

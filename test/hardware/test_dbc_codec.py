@@ -348,6 +348,7 @@ def test_invalid_dbc_file_is_refused_in_one_line(tmp_path, content, refuses):
         DbcCodec(str(path))
 
 
+@pytest.mark.medium
 def test_file_cut_anywhere_is_refused_or_read(tmp_path):
     """The only possible error is that of the package."""
     text = FILE.read_text()

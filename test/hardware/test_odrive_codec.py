@@ -177,6 +177,7 @@ def test_frames_are_those_of_the_manual():
     assert host.to_links(Release()) == [Frame(identifier(node, 0x18), b'\0') for node in range(4)]
 
 
+@pytest.mark.medium
 def test_sync_requests_every_answer():
     """`SYNC` requests the sensor boards, remote frames the ODrives' wheel and motor messages."""
     host, link = make(), make()

@@ -10,6 +10,7 @@ import pytest
 ANGLE_STEP = 2.0 * np.pi / 2 ** 14
 
 
+@pytest.mark.medium
 def test_samples_are_those_of_the_table(world) -> None:
     world.samples.clear()
     world.run(2.0)
@@ -26,6 +27,7 @@ def test_samples_are_those_of_the_table(world) -> None:
         assert abs(np.mean(read) - expected) < 5.0 * 1.7453e-3 / np.sqrt(470) + ANGLE_STEP
 
 
+@pytest.mark.medium
 def test_stamps_are_times_of_measurement(world) -> None:
     world.run(4.0)
     world.samples.clear()
@@ -47,6 +49,7 @@ def test_clocks_are_estimated(world) -> None:
         assert link.clock.jitter < 1e-4
 
 
+@pytest.mark.medium
 def test_torque_reaches_the_wheels_and_is_reported(world) -> None:
     world.torque(0.01, 0.01, 0.01, 0.01)
     assert world.arm() == (True, 'armed')
@@ -63,6 +66,7 @@ def test_torque_reaches_the_wheels_and_is_reported(world) -> None:
         np.diff(positions, axis=0)[-100:] / 4e-3, speeds[-100:], atol=0.5)
 
 
+@pytest.mark.medium
 def test_disarming_ends_torque(world) -> None:
     world.torque(0.01, 0.01, 0.01, 0.01)
     assert world.arm()[0]
@@ -74,6 +78,7 @@ def test_disarming_ends_torque(world) -> None:
     np.testing.assert_allclose(world.samples[-1].wheels.efforts, 0.0, atol=1e-9)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('loss', [0.01, 0.05])
 def test_lost_frames_are_counted_and_do_no_harm(world, loss: float) -> None:
     world.wire.loss = loss

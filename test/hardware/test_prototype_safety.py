@@ -56,6 +56,7 @@ def wait(world, condition, seconds: float) -> float:
     return (world.wire.now_ns - begin_ns) * 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('kind', 'state', 'within', 'rule', 'numbers'), [
     ('silent', DeviceState.DISARMED, 0.07, 'wheel_silent', ['0.05 s']),
     ('hot', DeviceState.DISARMED, 0.4, 'overtemperature', ['90 deg C', '80 deg C']),
@@ -82,6 +83,7 @@ def test_link_fault_stops_the_wheels(driven, kind, state, within, rule, numbers)
     assert driven.arm() == (True, 'armed')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('kind', 'state'), [
     ('silent', DeviceState.DISARMED), ('hot', DeviceState.DISARMED),
     ('reboot', DeviceState.EMERGENCY_STOP)])
@@ -103,6 +105,7 @@ def test_parked_wheels_are_monitored_too(make_world, kind, state) -> None:
     assert_coasting(world)
 
 
+@pytest.mark.slow
 def test_heartbeat_lost_while_armed_is_an_emergency_stop(driven) -> None:
     # Only the heartbeats are lost: the wheels answer.
     driven.wire.lost_ids.update(
@@ -115,6 +118,7 @@ def test_heartbeat_lost_while_armed_is_an_emergency_stop(driven) -> None:
     assert_coasting(driven)
 
 
+@pytest.mark.medium
 def test_link_that_stays_silent_is_disarmed_first_and_then_an_emergency_stop(driven) -> None:
     driven.wire.emulators[0].inject_fault('link_b', 'silent')
     assert wait(driven, lambda: not driven.testbed.arming.armed, 0.07) > 0.04
@@ -133,6 +137,7 @@ def test_link_that_stays_silent_is_disarmed_first_and_then_an_emergency_stop(dri
     assert driven.arm() == (True, 'armed')
 
 
+@pytest.mark.medium
 def test_silent_link_has_no_effect_while_disarmed(driven) -> None:
     driven.testbed.disarm('test')
     driven.run(0.1)
@@ -141,6 +146,7 @@ def test_silent_link_has_no_effect_while_disarmed(driven) -> None:
     assert driven.testbed.arming.state is DeviceState.DISARMED
 
 
+@pytest.mark.medium
 def test_link_that_returns_at_once_is_only_disarmed(driven) -> None:
     driven.wire.emulators[0].inject_fault('link_b', 'silent')
     wait(driven, lambda: not driven.testbed.arming.armed, 0.07)
@@ -152,6 +158,7 @@ def test_link_that_returns_at_once_is_only_disarmed(driven) -> None:
     assert driven.testbed.arming.state is DeviceState.DISARMED
 
 
+@pytest.mark.medium
 def test_diagnostics_list_the_faults_of_a_link_by_severity(driven) -> None:
     driven.wire.emulators[0].inject_fault('link_c', 'hot')
     driven.run(1.5)
@@ -160,6 +167,7 @@ def test_diagnostics_list_the_faults_of_a_link_by_severity(driven) -> None:
                   'link_c: hot: temperature 90 deg C, limit 65 deg C'}
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('seconds', [1.0, 10.0])
 def test_after_a_bus_failure_wheels_coast_until_armed(driven, seconds) -> None:
     emulator = driven.wire.emulators[0]
@@ -184,6 +192,7 @@ def test_after_a_bus_failure_wheels_coast_until_armed(driven, seconds) -> None:
     assert emulator.samples.wheels.efforts == pytest.approx(TORQUE, rel=1e-3)
 
 
+@pytest.mark.medium
 def test_links_coast_by_themselves_when_the_host_is_gone(driven) -> None:
     wire = driven.wire
     end_ns = wire.now_ns + 110_000_000
@@ -196,6 +205,7 @@ def test_links_coast_by_themselves_when_the_host_is_gone(driven) -> None:
     assert_coasting(driven)
 
 
+@pytest.mark.medium
 def test_broken_bus_is_a_fault_and_is_opened_again(driven) -> None:
     driven.wire.broken = True
     with pytest.raises(BusError):
@@ -207,6 +217,7 @@ def test_broken_bus_is_a_fault_and_is_opened_again(driven) -> None:
     assert driven.arm() == (True, 'armed')
 
 
+@pytest.mark.medium
 def test_missing_gyros_are_reported(make_world) -> None:
     world = make_world(settings=PrototypeSettings(gyro=True))
     world.run(1.0)
@@ -218,6 +229,7 @@ def test_missing_gyros_are_reported(make_world) -> None:
     assert world.prototype.diagnostics()['link_a'] == NO_RATE
 
 
+@pytest.mark.medium
 def test_broken_bus_during_a_stop_is_not_opened_at_every_tick(driven) -> None:
     """Opening a bus may take seconds, in which nothing is received."""
     driven.testbed.emergency_stop('test')
@@ -235,6 +247,7 @@ def test_broken_bus_during_a_stop_is_not_opened_at_every_tick(driven) -> None:
     assert driven.testbed.arming.state is DeviceState.DISARMED
 
 
+@pytest.mark.medium
 def test_emergency_stop_latches_in_the_links_too(driven) -> None:
     driven.testbed.emergency_stop('test')
     driven.run(0.01)
@@ -248,6 +261,7 @@ def test_emergency_stop_latches_in_the_links_too(driven) -> None:
     assert [firmware(driven, link).state for link in range(4)] == [LinkState.IDLE] * 4
 
 
+@pytest.mark.medium
 def test_link_that_restarts_during_a_stop_is_stopped(driven) -> None:
     driven.testbed.emergency_stop('test')
     driven.run(0.05)
@@ -268,6 +282,7 @@ def test_close_ends_all_torque(driven) -> None:
     assert [firmware(driven, link).state for link in range(4)] == [LinkState.IDLE] * 4
 
 
+@pytest.mark.medium
 def test_two_links_with_one_identifier_stop_all(driven) -> None:
     driven.wire.emulators.append(driven.emulator((1,), 'prototype', seed=7))
     wait(driven, lambda: driven.testbed.arming.state is DeviceState.EMERGENCY_STOP, 1.0)
@@ -299,6 +314,7 @@ def test_missing_links_are_named_and_nothing_is_driven(make_world, links) -> Non
         assert f'{name}: no heartbeat' in reason
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('kind', ['foreign', 'replayed'])
 def test_bad_frames_are_ignored_and_counted(driven, kind) -> None:
     driven.wire.emulators[0].inject_fault('link_a', kind)
@@ -313,6 +329,7 @@ def test_bad_frames_are_ignored_and_counted(driven, kind) -> None:
     assert driven.samples[-1].wheels.efforts == pytest.approx(TORQUE, rel=1e-3)
 
 
+@pytest.mark.medium
 def test_repeated_heartbeats_are_rejected(driven) -> None:
     beats = [driven.codec.to_host(Heartbeat(
         1, sequence, LinkState.ARMED, frozenset(), 12.0, 30.0,
@@ -329,6 +346,7 @@ def test_repeated_heartbeats_are_rejected(driven) -> None:
     assert 'link_b: heartbeat_lost: ' in driven.testbed.arming.reason
 
 
+@pytest.mark.medium
 def test_heartbeats_are_accepted_after_a_long_silence(driven) -> None:
     """The durations give different sequence numbers of the first heartbeat after the silence."""
     for seconds in (1.2, 1.25, 1.3, 1.4, 1.6):
@@ -340,6 +358,7 @@ def test_heartbeats_are_accepted_after_a_long_silence(driven) -> None:
         assert driven.arm() == (True, 'armed')
 
 
+@pytest.mark.medium
 def test_old_command_does_not_move_a_wheel(driven) -> None:
     """Frames recorded while the wheels are driven are replayed after disarming."""
     recorded = [frame for frame in driven.wire.sent_frames
@@ -368,6 +387,7 @@ def test_host_with_a_new_count_is_accepted_after_a_timeout_without_power(world) 
     assert link.state is LinkState.IDLE
 
 
+@pytest.mark.medium
 def test_wheel_that_turns_too_fast_is_not_armed(world) -> None:
     world.torque(0.03, 0.0, 0.0, 0.0)
     assert world.arm()[0]
@@ -380,6 +400,7 @@ def test_wheel_that_turns_too_fast_is_not_armed(world) -> None:
     assert reason.endswith(' 30 rad/s')
 
 
+@pytest.mark.medium
 def test_motor_that_gives_torque_without_power_stops_everything(world) -> None:
     world.torque(0.001)
     assert world.arm()[0]
@@ -392,6 +413,7 @@ def test_motor_that_gives_torque_without_power_stops_everything(world) -> None:
     assert 'link_c: unasked_torque: ' in world.testbed.arming.reason
 
 
+@pytest.mark.medium
 def test_stop_of_another_host_stops_the_links(driven) -> None:
     stop, = driven.codec.to_links(Stop())
     driven.wire.emulators[0].receive(stop, driven.wire.now_ns)
@@ -401,6 +423,7 @@ def test_stop_of_another_host_stops_the_links(driven) -> None:
     assert_coasting(driven)
 
 
+@pytest.mark.medium
 def test_links_stopped_by_another_host_are_released_by_a_reset(world) -> None:
     """An earlier host has stopped the links, or the release was lost."""
     world.wire.send(world.codec.to_links(Stop())[0])
@@ -416,6 +439,7 @@ def test_links_stopped_by_another_host_are_released_by_a_reset(world) -> None:
     assert world.arm() == (True, 'armed')
 
 
+@pytest.mark.medium
 def test_links_stay_stopped_until_a_reset_arrives(driven) -> None:
     driven.testbed.emergency_stop('test')
     driven.run(0.1)
@@ -433,6 +457,7 @@ def test_links_stay_stopped_until_a_reset_arrives(driven) -> None:
     assert driven.arm() == (True, 'armed')
 
 
+@pytest.mark.medium
 def test_flood_of_foreign_frames_does_not_delay_the_host(driven) -> None:
     for _ in range(5000):
         driven.wire.inject(Frame(0x7FF, b'?'))

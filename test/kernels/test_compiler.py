@@ -126,6 +126,7 @@ def test_edited_callee_in_another_module_is_compiled(run, package):
     assert run()['scaled'] == 10.0
 
 
+@pytest.mark.medium
 def test_division_by_zero_is_inf_as_in_numpy(first):
     assert first['inverse'] == float('inf')
 
@@ -134,6 +135,7 @@ def test_nothing_is_written_beside_the_sources(common, first):
     assert not list(common.root.rglob('*.nbi'))
 
 
+@pytest.mark.medium
 def test_cache_is_in_the_users_cache_folder(common, first):
     home = Path(first['directory'])
     assert home.parent == common.folder / 'home' / '.cache' / 'fourbar_ros'
@@ -142,6 +144,7 @@ def test_cache_is_in_the_users_cache_folder(common, first):
     assert list(xdg.rglob('*.nbi'))
 
 
+@pytest.mark.medium
 def test_numba_cache_dir_of_the_user_has_priority(common, chosen):
     assert chosen['directory'] == str(common.folder / 'chosen')
     assert list((common.folder / 'chosen').rglob('*.nbi'))
@@ -152,6 +155,7 @@ def test_other_code_keeps_its_own_cache_folder(common, first, chosen):
     assert chosen['numba'] == str(common.folder / 'chosen')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('variables', [
     {'HOME': NOWHERE, 'XDG_CACHE_HOME': NOWHERE}, {'NUMBA_CACHE_DIR': NOWHERE}])
 def test_temporary_folder_replaces_a_cache_that_is_not_writable(run, tmp_path, variables):
@@ -161,6 +165,7 @@ def test_temporary_folder_replaces_a_cache_that_is_not_writable(run, tmp_path, v
     assert second['loaded'] == 1
 
 
+@pytest.mark.medium
 def test_temporary_folder_that_others_can_write_to_is_not_used(run, tmp_path):
     trap = tmp_path / f'fourbar_ros-{os.getuid()}'
     trap.mkdir()
@@ -170,6 +175,7 @@ def test_temporary_folder_that_others_can_write_to_is_not_used(run, tmp_path):
     assert not list(trap.iterdir())
 
 
+@pytest.mark.medium
 def test_kernels_run_without_a_writable_folder(run):
     result = run(temporary=NOWHERE, HOME=NOWHERE, XDG_CACHE_HOME=NOWHERE)
     assert result['scaled'] == 6.0
@@ -177,6 +183,7 @@ def test_kernels_run_without_a_writable_folder(run):
     assert len(result['notes']) == 1 and 'every start compiles' in result['notes'][0]
 
 
+@pytest.mark.medium
 def test_old_folders_are_removed_and_others_kept(run, tmp_path):
     cache = tmp_path / 'home' / '.cache' / 'fourbar_ros'
     long_ago = 1.6e9

@@ -97,6 +97,7 @@ def check_tracking(loop: ClosedLoop, steps: list[Step]) -> None:
     assert loop.estimator.starts == 1
 
 
+@pytest.mark.medium
 def test_quarter_turn_of_the_paper(make_loop: MakeLoop) -> None:
     loop = make_loop()
     steps = quarter_turn(loop)
@@ -107,6 +108,7 @@ def test_quarter_turn_of_the_paper(make_loop: MakeLoop) -> None:
     assert energy == pytest.approx(2.6452e-3, rel=0.1)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('branch', ['open', 'crossed'])
 def test_linkage_without_symmetry_on_both_branches(
     branch: str, uneven: Mechanism, make_loop: MakeLoop,
@@ -118,6 +120,7 @@ def test_linkage_without_symmetry_on_both_branches(
     assert branch_of(steps[-1].samples.truth.link_angles) == branch  # type: ignore[union-attr]
 
 
+@pytest.mark.medium
 def test_crossed_branch_of_an_antiparallelogram(make_loop: MakeLoop) -> None:
     """Opposite links are equal and neighbours are not."""
     rectangle = Mechanism(  # type: ignore[arg-type]
@@ -136,6 +139,7 @@ def momentum(loop: ClosedLoop, step: Step) -> float:
                             absolute_speeds(step))
 
 
+@pytest.mark.medium
 def test_total_momentum_stays_zero_while_wheels_and_links_exchange_it(make_loop: MakeLoop) -> None:
     loop = make_loop()
     steps = quarter_turn(loop)
@@ -144,6 +148,7 @@ def test_total_momentum_stays_zero_while_wheels_and_links_exchange_it(make_loop:
     assert max(abs(momentum(loop, step)) for step in steps) < 22000 * 10 * 1.1e-16 * traded
 
 
+@pytest.mark.medium
 def test_emergency_stop_in_motion_lets_the_wheels_coast(make_loop: MakeLoop) -> None:
     loop = make_loop()
     loop.controller.setpoint(['link_a', 'link_b'], [pi / 2, pi / 3 + pi / 2])
@@ -168,6 +173,7 @@ def test_emergency_stop_in_motion_lets_the_wheels_coast(make_loop: MakeLoop) -> 
     assert loop.arm()[0] is False
 
 
+@pytest.mark.medium
 def test_run_again_after_an_emergency_stop(make_loop: MakeLoop) -> None:
     """After reset and arming, the controller stops the drifting links."""
     loop = make_loop()
@@ -204,6 +210,7 @@ def fingerprint(loop: ClosedLoop) -> bytes:
     return np.array(values).tobytes()
 
 
+@pytest.mark.medium
 def test_same_seed_same_bytes(make_loop: MakeLoop) -> None:
     first = fingerprint(make_loop(seed=5))
     assert first == fingerprint(make_loop(seed=5))

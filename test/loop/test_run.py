@@ -28,6 +28,7 @@ HALF_A_DEGREE = pi / 360.0
 PERIOD_NS = 4_000_000
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('name', ['paper', 'prototype'])
 def test_preset_completes_its_quarter_turn(name: str) -> None:
     scenario = load_scenario(name)
@@ -52,6 +53,7 @@ def test_preset_completes_its_quarter_turn(name: str) -> None:
     assert np.isnan(found[f'flywheel_command.{left_out}'][100:]).all()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('heading', ['link_a', 'link_d'])
 def test_prototype_with_joint_encoders_and_one_heading(heading: str) -> None:
     """The estimate of the turn is as accurate with sensors of the other kind."""
@@ -129,6 +131,7 @@ def test_refused_arming_ends_the_run(
         list(run_scenario(load_scenario('paper')))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('name', ['paper', 'prototype'])
 def test_same_seed_same_bytes(name: str) -> None:
     scenario = replace(load_scenario(name), duration=0.6)

@@ -54,6 +54,7 @@ def error_of(step: Step) -> float:
     return float(np.abs(step.estimate.link_angles - step.samples.truth.link_angles).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('link', 'kind', 'value'), [
     (n % 4, *fault) for n, fault in enumerate(FAULTS)])
 def test_fault_of_one_sensor_is_isolated_and_the_error_is_small(
@@ -79,6 +80,7 @@ def test_fault_of_one_sensor_is_isolated_and_the_error_is_small(
     assert worst < LARGEST_ERROR
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('seed', range(2))
 def test_wheels_alone_drive_the_estimate_for_a_second_until_it_is_lost(
     seed: int, scenario: Scenario,
@@ -98,6 +100,7 @@ def test_wheels_alone_drive_the_estimate_for_a_second_until_it_is_lost(
     assert not loop.supervisor.arming.armed
 
 
+@pytest.mark.medium
 def test_no_sensor_is_reported_without_a_fault(scenario: Scenario) -> None:
     """Without a fault no sensor is reported; a hundred runs are in `study consistency`."""
     for seed in range(2):

@@ -51,6 +51,7 @@ def energy(run: Recorded, name: str) -> NDArray[np.float64]:
     return run['energy.position'][:, ENERGIES.index(name)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('allocation', ['min_norm', 'two_wheels'])
 def test_both_allocations_make_the_turn(allocation: str, runs: dict[str, Recorded]) -> None:
     """The comparison of the wheels needs equal motions."""

@@ -95,6 +95,7 @@ def only(story: Story, wheel: str) -> None:
     assert set(story.named) == {wheel}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('command', COMMANDS)
 @pytest.mark.parametrize(('wheel', 'kind', 'at'), [
     (0, 'dead', 2.4), (3, 'dead', 6.4), (1, 'stuck', 3.0), (2, 'stuck', 5.4)])
@@ -110,6 +111,7 @@ def test_faulty_wheel_is_isolated_and_the_others_finish(
     np.testing.assert_array_equal(story.powered, np.arange(4) != wheel)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('command', COMMANDS)
 @pytest.mark.parametrize(('wheel', 'kind', 'value', 'at'), [
     (1, 'weak', None, 3.0), (2, 'dragging', None, 3.4), (0, 'delayed', None, 2.4)])
@@ -126,6 +128,7 @@ def test_degraded_wheel_is_isolated_and_keeps_its_power(
     assert story.powered.all()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('command', COMMANDS)
 @pytest.mark.parametrize('at', [2.4, 6.4])
 def test_runaway_wheel_is_cut_within_0_2_s(at: float, command: str, scenario: Scenario) -> None:
@@ -137,6 +140,7 @@ def test_runaway_wheel_is_cut_within_0_2_s(at: float, command: str, scenario: Sc
     assert story.final <= 1.0
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('command', COMMANDS)
 def test_shorted_wheel_stops_the_manoeuvre(
     command: str, scenario: Scenario,
@@ -147,6 +151,7 @@ def test_shorted_wheel_stops_the_manoeuvre(
     assert 'flywheel_d' in story.problem
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('command', COMMANDS)
 def test_one_wheel_of_each_pair_completes_the_manoeuvre(command: str, scenario: Scenario) -> None:
     story = run(scenario, command, 4.0, Fault('flywheel_a', 'dead'), Fault('flywheel_b', 'stuck'))
@@ -155,6 +160,7 @@ def test_one_wheel_of_each_pair_completes_the_manoeuvre(command: str, scenario: 
     assert story.final <= LARGEST_FINAL_ERROR
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('command', COMMANDS)
 def test_lost_axis_is_named_and_the_other_one_is_held(command: str, scenario: Scenario) -> None:
     story = run(scenario, command, 4.0, Fault('flywheel_a', 'dead'), Fault('flywheel_c', 'dead'))
@@ -163,6 +169,7 @@ def test_lost_axis_is_named_and_the_other_one_is_held(command: str, scenario: Sc
     assert story.off_b < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('command', COMMANDS)
 def test_no_wheel_fault_with_wrong_inertias(command: str, scenario: Scenario) -> None:
     """Errors of 5 % of wheel and link inertias cause no wheel fault in either manoeuvre."""
@@ -180,6 +187,7 @@ def test_no_wheel_fault_with_wrong_inertias(command: str, scenario: Scenario) ->
         assert story.final < 0.1, f'seed {seed}'
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('command', COMMANDS)
 def test_device_that_does_not_drive_is_no_fault_of_its_wheels(
     command: str, scenario: Scenario,

@@ -89,6 +89,7 @@ def driven(rng: np.random.Generator) -> tuple[Array, Array, Array]:
     return rng.uniform(-0.3, 0.3, 4), rng.uniform(0.5, 3.0, 4), rng.uniform(-3.0, 3.0, 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', SEEDS)
 def test_motion_agrees_with_an_independent_derivation(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
@@ -363,6 +364,7 @@ def test_soft_rhombus_passes_change_points_as_a_parallelogram(change_point: floa
 
 # --- Steps ------------------------------------------------------------------------------------
 
+@pytest.mark.medium
 @pytest.mark.parametrize(('stiffness', 'damping'), [(1e5, 0.0), (1e5, 50.0), (1e3, 500.0)])
 def test_long_steps_at_stiff_joints_stay_stable(stiffness: float, damping: float) -> None:
     """Links of 0.3 m and 0.6 kg start at rest with gaps of 1 mm; ten seconds at 5 ms."""

@@ -68,6 +68,7 @@ def test_any_linkage_against_singular_values(
             assert gain == pytest.approx(wanted, abs=1e-9), (case, left)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('seed', SEEDS)
 def test_condition_is_that_of_kanes_method(seed: int, random_linkage: Draw) -> None:
     """The reference is the mass matrix by SymPy, with translation and c, d eliminated."""

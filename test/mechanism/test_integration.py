@@ -216,6 +216,7 @@ def test_opposite_torques_do_not_move_a_parallelogram(
     np.testing.assert_allclose(loaded[:, :8], free[:, :8], rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.medium
 def test_a_million_steps_lose_no_momentum(
     random_linkage: Draw, random_state: Callable[..., Array],
 ) -> None:

@@ -155,6 +155,7 @@ def test_opposite_links_stay_parallel_during_a_passage(
     assert apart.max() < ROUNDING
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('change_point', CHANGE_POINTS)
 @pytest.mark.parametrize('seed', SEEDS)
 def test_passage_conserves_momentum(
@@ -167,6 +168,7 @@ def test_passage_conserves_momentum(
     assert max(drift) < ROUNDING * momentum_scale(linkage, links_alone[0])
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('change_point', CHANGE_POINTS)
 @pytest.mark.parametrize('seed', SEEDS)
 def test_passage_conserves_energy(
@@ -186,6 +188,7 @@ def test_passage_has_no_jump(seed: int, change_point: float, random_parallelogra
     assert np.abs(np.diff(states[:, LINK_ANGLES], axis=0)).max() < STEP * fastest
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('change_point', CHANGE_POINTS)
 @pytest.mark.parametrize('seed', SEEDS)
 def test_passage_is_that_of_a_linkage_without_change_points(
@@ -195,6 +198,7 @@ def test_passage_is_that_of_a_linkage_without_change_points(
     assert_moves_like_two_angles(linkage, states, NONE)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('change_point', CHANGE_POINTS)
 @pytest.mark.parametrize('seed', SEEDS)
 def test_motion_may_start_on_a_change_point(
@@ -204,6 +208,7 @@ def test_motion_may_start_on_a_change_point(
     assert_moves_like_two_angles(linkage, states, NONE)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('change_point', CHANGE_POINTS)
 @pytest.mark.parametrize('seed', SEEDS)
 def test_moving_linkage_passes_under_torque_too(
@@ -340,6 +345,7 @@ def test_mismatch_folds_as_kane_equations_do(
     assert np.abs(expected[-1, 2] - expected[-1, 0]) > 0.2
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(('mismatch', 'change_point', 'rate', 'link'), FOLDS)
 def test_mismatch_folds_as_in_a_stiff_engine(
     mismatch: float, change_point: float, rate: float, link: int,

@@ -46,6 +46,7 @@ def law(case: Case, times: Array) -> tuple[Array, Array]:
 # --- An independent derivation ----------------------------------------------------------------
 
 # One, two and four prescribed wheels; each choice needs its own derivation of two seconds.
+@pytest.mark.medium
 @pytest.mark.parametrize('prescribed', [
     (False, True, False, False), (True, False, True, False), (True, True, True, True)])
 @pytest.mark.parametrize('seed', range(3))

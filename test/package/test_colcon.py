@@ -20,7 +20,7 @@ SOURCED = ('sh', '-c', '. install/setup.sh && exec "$@"', 'sh')
 PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']])
 
 
-@pytest.fixture(scope='module', params=['copied', 'linked'])
+@pytest.fixture(scope='module', params=['copied', pytest.param('linked', marks=pytest.mark.slow)])
 def workspace(request, tmp_path_factory, copy_tree, check):
     """Build a copy of the tree in its own workspace, and return the workspace."""
     workspace = tmp_path_factory.mktemp(request.param)

@@ -57,6 +57,7 @@ def test_every_fault_is_written_and_read(target: str, kind: str) -> None:
     assert parse_fault(target, str(fault)) == fault
 
 
+@pytest.mark.medium
 @settings(deadline=None, derandomize=True)
 @given(value=st.floats(-pi, pi))
 def test_a_value_survives_writing(value: float) -> None:

@@ -232,6 +232,7 @@ def test_same_seed_same_bytes(make_plant: MakePlant) -> None:
     assert record(make_plant(table=table, seed=7)) != record(make_plant(table=table, seed=8))
 
 
+@pytest.mark.medium
 @settings(deadline=None, max_examples=200, derandomize=True)
 @given(count=st.integers(1, 100_000), step=st.floats(1e-6, 0.1))
 def test_whole_multiples_are_counted(count: int, step: float, make_plant: MakePlant) -> None:

@@ -190,6 +190,7 @@ def test_samples_are_on_the_nearest_count(counts: int, turns: int) -> None:
     assert (np.abs(errors) <= step / 2.0 + 2e-12).all()
 
 
+@pytest.mark.medium
 @hypothesis.settings(deadline=None, max_examples=300, derandomize=True)
 @hypothesis.given(angle=st.floats(-1e4, 1e4) | st.integers(-9, 9).map(lambda n: n * pi)
                   | st.integers(-9, 9).map(lambda n: float(np.nextafter(n * pi, 0.0))),
@@ -302,6 +303,7 @@ def arrivals(settings: LinkSensorSettings, count: int = COUNT) -> dict[str, Arra
     return {name: np.array(values) for name, values in delays.items()}
 
 
+@pytest.mark.medium
 def test_jitter_is_half_normal_beyond_the_latency() -> None:
     latency, jitter = 4e-3, 2e-3
     for name, delays in arrivals(LinkSensorSettings(latency=latency, jitter=jitter), 400).items():
@@ -424,6 +426,7 @@ def test_sensor_after_a_fault_equals_one_without_a_fault(kind: str) -> None:
         expected.stamps >= ticks[300]].tobytes()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('changed', [
     {'dropout': 0.2}, {'jitter': 5e-3}, {'gyro': True, 'gyro_noise_rms': 0.1}, {'latency': 0.1}])
 def test_other_settings_do_not_change_the_noise(changed: dict[str, Any]) -> None:
@@ -480,6 +483,7 @@ def test_garbage_of_an_encoder_is_whole_counts() -> None:
     assert len(np.unique(angles)) == 8
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('value', [0.1, -0.7, pi])
 def test_wrong_adds_its_value(value: float) -> None:
     noisy = LinkSensorSettings(noise_rms=2e-3)

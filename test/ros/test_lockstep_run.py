@@ -82,7 +82,8 @@ def over_topics(scenario, suite, probe, namespace):
                          if stamp_of(message) <= last_ns}.values()) for topic in TOPICS}
 
 
-@pytest.mark.parametrize('preset', ['paper', 'prototype'])
+@pytest.mark.parametrize(
+    'preset', [pytest.param('paper', marks=pytest.mark.slow), 'prototype'])
 def test_every_sample_is_the_same(suite, make_probe, preset):
     """All bits agree, with noise, latency and dropout, under any load of the machine."""
     scenario = replace(load_scenario(preset), seed=11)

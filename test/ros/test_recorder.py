@@ -108,7 +108,9 @@ def numbers(bag, topic):
                 for connection, _, data in reader.messages(connections)] if connections else None
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+@pytest.mark.parametrize(
+    'number', [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)],
+    ids=lambda n: n.name)
 def test_every_message_is_in_the_bag_after_a_signal(node, record, tmp_path, number, publish):
     first, second = (node.create_publisher(JointState, name, 10) for name in ('one', 'two'))
     process = record('-o', 'bag', fresh=number == signal.SIGINT)

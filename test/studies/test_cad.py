@@ -123,6 +123,7 @@ def fitted():
     return best, fit_wheel_counted_twice()
 
 
+@pytest.mark.medium
 def test_fits_reproduce_both_numbers_and_all_statements(fitted) -> None:
     best, twice = fitted
     assert best.sizes['offset_y_same'] == pytest.approx(7.40e-3, abs=5e-6)
@@ -155,6 +156,7 @@ def test_kanes_method_gives_the_same_differences(fitted) -> None:
             assert found == pytest.approx(RMS[test], abs=1e-7)
 
 
+@pytest.mark.medium
 def test_two_defects_do_not_determine_the_amplitude(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cad, 'PAIR_AMPLITUDES', np.array([20.0, 80.0]))
     found = fit_two(('inertia_all', 'offset_y_inside'))

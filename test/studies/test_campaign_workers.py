@@ -68,6 +68,7 @@ def singles(items: list[Any]) -> list[list[Any]]:
     return [[item] for item in items]
 
 
+@pytest.mark.medium
 def test_results_come_in_the_order_of_the_items(imported: Callable[[str], Any]) -> None:
     assert list(map_ordered(abs, [-3, 2, -1], 2)) == [3, 2, 1]
     assert list(map_ordered(abs, [-3], 2)) == [3]
@@ -75,12 +76,14 @@ def test_results_come_in_the_order_of_the_items(imported: Callable[[str], Any]) 
     assert list(map_ordered(imported('slow_first'), list(range(6)), 2)) == list(range(6))
 
 
+@pytest.mark.medium
 def test_results_that_are_ready_come_first(imported: Callable[[str], Any]) -> None:
     found = list(completed_locally(imported('slow_first'), singles(list(range(6))), 2))
     assert sorted(found) == singles(list(range(6)))
     assert found[0] != [0]
 
 
+@pytest.mark.medium
 def test_linear_algebra_takes_one_thread_in_each_process(
         imported: Callable[[str], Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """A number that the user sets is kept."""
@@ -109,6 +112,7 @@ def test_item_that_kills_its_process_again_is_an_error(imported: Callable[[str],
     assert sorted(found) == [0, 1, 3, 4, 5]
 
 
+@pytest.mark.medium
 def test_no_process_is_left(imported: Callable[[str], Any]) -> None:
     pids = set(map_ordered(imported('process_id'), list(range(8)), 2))
     assert os.getpid() not in pids
@@ -135,6 +139,7 @@ def test_interrupt_while_processes_start_is_not_lost() -> None:
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
+@pytest.mark.medium
 def test_interrupt_of_all_processes_ends_them_without_output(
         wait_until: Callable[[Callable[[], Any], str], None]) -> None:
     # A process in the background of a shell ignores interrupts.

@@ -80,6 +80,7 @@ def test_cond_depends_on_the_sign_of_unequal_offsets() -> None:
         condition(rhombus(unequal, -0.04), 0.3), rel=1e-3)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('name', list(SIGNS))
 def test_span_ends_where_condition_reaches_its_limit(name: str) -> None:
     for theta in np.radians([14.0, 30.0, 60.0]):
@@ -109,6 +110,7 @@ def test_checks_pass(result: Result) -> None:
     assert 0.0 < result.data['grid_seconds']
 
 
+@pytest.mark.slow
 def test_grids_are_written_and_symmetric(result: Result) -> None:
     for name, first in (('ratio', 'ratio'), ('offset_same', 'offset_m'),
                         ('offset_inside', 'offset_m')):

@@ -130,6 +130,7 @@ def test_bound_of_a_linear_system_is_the_covariance_of_its_kalman_filter(late: i
         np.testing.assert_allclose(bounds[step], expected, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('matched', [True, False])
 def test_bound_equals_the_covariance_of_the_filter_without_losses(
     matched: bool, scenario: Scenario,
@@ -181,6 +182,7 @@ def test_matched_table_follows_the_model_of_the_filter(scenario: Scenario) -> No
             table.surface.tilt_x) == (0.0, 0.0, 0.0, 0.0)
 
 
+@pytest.mark.medium
 def test_overconfident_filter_fails_the_checks(scenario: Scenario) -> None:
     """The random-walk torques are ten times the assumed ones, over two runs of 1.5 s."""
     made = replace(consistency.matched(scenario, 0), duration=1.5)

@@ -96,6 +96,7 @@ def test_every_method_has_the_same_draws(name: str) -> None:
             base}
 
 
+@pytest.mark.medium
 def test_every_seed_has_other_draws_within_the_spread() -> None:
     """In seeds 0 to 39 one of four links or signs is missing with a probability of 4 %."""
     base = load_scenario('prototype')
@@ -286,6 +287,7 @@ def test_numbers_are_of_the_runs_that_they_name(
     assert not any(cell in ('', 'nan') for row in rows for cell in row.values())
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(('lost', 'kept'), [(0, True), (3, True), (4, False), (300, False)])
 def test_one_run_in_a_hundred_may_fail_and_not_more(
     lost: int, kept: bool, monkeypatch: pytest.MonkeyPatch,

@@ -42,6 +42,7 @@ def odd_step(speeds=None, law: str = 'min_norm'):
         make_allocation(law, ODD.flywheel_inertias, [True] * 4), speeds)
 
 
+@pytest.mark.medium
 def test_study_passes_its_checks_and_has_its_keys() -> None:
     result = run(lambda items, _: items)
     assert [check.name for check in result.checks if not check.passed] == []

@@ -99,6 +99,7 @@ def test_least_at_a_weight_is_that_of_finite_elements(weight: float) -> None:
         TURN * np.sqrt(trapezoid((phi - reference) ** 2, s)), rel=1e-4)
 
 
+@pytest.mark.medium
 def test_equal_pairs_are_the_best() -> None:
     """The root of the least eq. 9 is convex in the squared error, so equal errors are best."""
     errors = np.radians(np.linspace(0.05, 20.0, 60))
@@ -207,6 +208,7 @@ def test_two_processes_with_the_same_searches_do_not_disturb_each_other(
     assert len(list((tmp_path / 'searches').iterdir())) == 5
 
 
+@pytest.mark.slow
 def test_paper_inertias_are_worse_by_what_their_pairs_differ(quick: list[int]) -> None:
     paper = study(None).data['paper_inertias']
     assert paper['eq9_least_over_four_nominal'] == pytest.approx(1 / 2.25 + 1 / 1.18)

@@ -60,6 +60,7 @@ def moving(uneven: Mechanism) -> Case:
         times=np.linspace(0.0, 2.0, 21), prescribed=FREE)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('name', [
     'asymmetric', 'paper_all', 'paper_pair_ac', 'parallelogram_offset_spinning'])
 def test_reference_motions(name: str) -> None:
@@ -94,6 +95,7 @@ def test_wheels_locked_to_their_links_conserve_momentum_and_energy(
     np.testing.assert_allclose(energy, energy[0], rtol=1e-11)
 
 
+@pytest.mark.medium
 def test_mixed_wheels_conserve_momentum_and_follow_their_laws(
     moving: Case, conserved: Conserved,
 ) -> None:

@@ -37,6 +37,7 @@ def draws(made: Campaign, column: str, runs: int = RUNS) -> np.ndarray:
     return np.array([made.drawn(run)[column] for run in range(runs)])
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(('given', 'law'), [
     ({'uniform': [2.0, 3.0]}, uniform(2.0, 1.0)),
     ({'normal': {'mean': -1.0, 'std': 0.5}}, norm(-1.0, 0.5)),

@@ -156,6 +156,7 @@ def test_progress_begins_with_the_finished_runs() -> None:
     resume_at([1, 2], 1)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(('change', 'different'), [
     ({'seed': 6}, ['seed']),
     ({'duration': 0.4}, ['scenario.duration']),
@@ -196,6 +197,7 @@ def test_versions_cover_all_modules_that_determine_the_numbers() -> None:
         assert Path(str(inspect.getsourcefile(made_by))).resolve() in hashed
 
 
+@pytest.mark.medium
 def test_other_versions_are_not_mixed(
         campaign_file: Callable[..., str], tmp_path: Path, refuses: Refuses) -> None:
     path, folder = campaign_file(), tmp_path / 'out'
@@ -245,6 +247,7 @@ def test_full_disk_is_reported_and_finished_runs_are_stored(
     assert pyarrow.parquet.read_table(folder / 'runs.parquet')['run'].to_pylist() == list(range(6))
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures('small_batches')
 def test_many_parts_are_merged_and_duplicate_rows_count_once(
         campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

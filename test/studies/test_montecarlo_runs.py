@@ -26,6 +26,7 @@ from scipy.stats import rankdata
 from scipy.stats import t as student
 
 
+@pytest.mark.medium
 def test_metrics_equal_those_of_the_published_topics() -> None:
     """The same run is recorded as topics, and the metrics are computed from these."""
     scenario = load_scenario('prototype')
@@ -100,6 +101,7 @@ def test_device_that_disarms_is_a_failure() -> None:
     assert row['failure'] and not row['armed_at_end']
 
 
+@pytest.mark.medium
 def test_only_is_bit_identical_and_its_scenario_runs_anywhere(
     campaign_file: Callable[..., str], tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -147,6 +149,7 @@ def test_same_seed_gives_same_bytes_for_any_number_of_jobs(
         table['tracking_rms_rad'].to_pylist()[:3])
 
 
+@pytest.mark.slow
 def test_limits_of_a_campaign_become_checks_and_figures_are_pictures(
         campaign_file: Callable[..., str], tmp_path: Path) -> None:
     path = campaign_file(limits={'work_j': {'quantile': 0.5, 'at_most': 1e-9},
@@ -188,6 +191,7 @@ def test_statistics_of_a_known_sample() -> None:
     assert statistics(np.array([nan])).n == 0
 
 
+@pytest.mark.medium
 def test_confidence_interval_of_the_mean_has_its_coverage() -> None:
     seed, trials = 11, 2000
     rng = np.random.default_rng(seed)

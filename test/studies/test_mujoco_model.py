@@ -124,6 +124,7 @@ def test_momentum_and_energy_are_those_of_the_mechanism(uneven: Mechanism) -> No
             angular_momentum(*motion), rel=1e-10)
 
 
+@pytest.mark.medium
 @each_case
 def test_stiff_closure_has_the_error_of_the_held_torque(path: Path) -> None:
     reference = Reference(path)
@@ -145,6 +146,7 @@ def test_error_of_euler_is_half_a_step(path: Path) -> None:
     assert 0.1 * STEP * travelled < reference.error(state) <= STEP * travelled
 
 
+@pytest.mark.medium
 @each_case
 def test_default_closure_is_compliant(path: Path) -> None:
     """The default closure of MuJoCo, 20 ms, has errors between 1e-8 and 1e-4 rad."""
@@ -154,6 +156,7 @@ def test_default_closure_is_compliant(path: Path) -> None:
     assert 10.0 * hard < soft < 1e-4
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(('integrator', 'order'), [('Euler', 1), ('RK4', 2)])
 def test_error_shrinks_with_the_step(integrator: str, order: int) -> None:
     """With RK4 only the held torque contributes, which is of second order."""

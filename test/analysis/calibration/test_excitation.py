@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 
+@pytest.mark.medium
 def test_one_wheel_after_the_other_and_all_come_to_rest(
         prototype: Mechanism, lab: Table, make_bed: Callable[..., Any]) -> None:
     """Only one wheel is driven at a time; seed 0."""
@@ -57,6 +58,7 @@ def test_first_direction_leads_away_from_change_points(
     assert change_point_margin(links.angles[known][-1]) > change_point_margin(angles) + 0.02
 
 
+@pytest.mark.medium
 def test_multi_sine_keeps_the_limit_and_does_not_drift(
         prototype: Mechanism, lab: Table, make_bed: Callable[..., Any]) -> None:
     """Links oscillate about their initial angles; seed 0."""

@@ -72,6 +72,7 @@ def test_only_noise_is_left_where_nothing_else_moved_the_links(
     assert max(found.residual_ratio for of_one in estimates.values() for _, found in of_one) < 1.2
 
 
+@pytest.mark.slow
 def test_disturbance_in_the_residuals_is_reported(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]]) -> None:
     """The disturbance is an oscillation of a degree, as after a contact with the edge."""

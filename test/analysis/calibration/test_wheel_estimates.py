@@ -49,6 +49,7 @@ def test_truth_is_found_to_one_percent_and_covered(
     assert covered >= binom.ppf(1e-3, 3 * len(SEEDS), 0.95), 'seeds 0-9'
 
 
+@pytest.mark.medium
 def test_all_wheels_one_after_the_other(
         prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
     """The friction for the controller is the mean; seed 7."""
@@ -63,6 +64,7 @@ def test_all_wheels_one_after_the_other(
         float(np.sqrt(one.covariance[1, 1])) for one in estimates)
 
 
+@pytest.mark.medium
 def test_recoil_of_the_links_is_accounted_for(
         prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
     """The recoil changes the inertia by that of the wheel over that of a pair, 0.3 %."""
@@ -74,6 +76,7 @@ def test_recoil_of_the_links_is_accounted_for(
     assert wrong / right - 1.0 == pytest.approx(-1.2e-4 / 0.039, rel=0.3)
 
 
+@pytest.mark.medium
 def test_unmodelled_error_widens_the_intervals(
         prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
     """The readings have an oscillation over many samples, which is no white noise; seed 2."""
