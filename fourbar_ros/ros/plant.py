@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 import struct
 from typing import Any
 
@@ -54,9 +55,14 @@ SETTLE_NS = 500_000_000
 # Stamp in a serialized message with a header: it follows four bytes of encapsulation.
 SERIALIZED_STAMP = struct.Struct('<4xiI')
 
+# Command timeout of the simulated table [s]. Programs that start on a shared computer delay the
+# nodes by several tenths of a second, and no hardware can be harmed meanwhile.
+COMMAND_TIMEOUT_S = 1.0
+
 _TABLE, *_OTHERS = table_parameters('ideal')
 PARAMETERS = (
-    *device_parameters('paper'),
+    *(replace(row, default=COMMAND_TIMEOUT_S) if row.name == 'command_timeout' else row
+      for row in device_parameters('paper')),
     _TABLE,
     Setting('clock', 'realtime', '', 'clock that the ticks follow',
             choices=('realtime', 'fast', 'lockstep')),
