@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 from fourbar_ros.common.config_files import config_file, load_yaml
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.common.settings import check_keys, Setting, SettingError, settings_of
+from fourbar_ros.common.settings import check_keys, Setting, setting, SettingError, settings_of
 from fourbar_ros.control import ControllerSettings
 from fourbar_ros.control.settings import SETTINGS as CONTROLLER
 from fourbar_ros.device import SupervisorSettings
@@ -51,6 +51,10 @@ class ScenarioError(FourbarError):
 class PlantSettings(SupervisorSettings):
     """Settings of the node `plant`: those of every device, and the integration step."""
 
+    # Programs that start on a shared computer delay nodes by several tenths of a second, and no
+    # hardware can be harmed meanwhile.
+    command_timeout: float = setting(
+        1.0, 's', 'longest time without a command while armed', low=0.002, high=10.0)
     step: float = field(default=_STEP.default, metadata={'setting': _STEP})
 
 

@@ -50,7 +50,7 @@ def prototype_text() -> str:
     for node, values in load_scenario('prototype').parameters().items():
         lines += ['', f'/**/{node}:', '  ros__parameters:']
         lines += [_yaml_line(row, values[row.name]) for row in TABLES[node]
-                  if not row.name.startswith('initial.') and row.name != 'command_timeout'
+                  if not row.name.startswith('initial.')
                   and values.get(row.name, row.default) != row.default]
     return '\n'.join(lines) + '\n'
 

@@ -25,6 +25,7 @@ from fourbar_ros.device import (
     Recovery,
     Samples,
 )
+from fourbar_ros.loop.scenario import PlantSettings
 from fourbar_ros.ros.base_node import run_node
 from fourbar_ros.ros.device_node import CATCH_UP_NS, device_parameters, DeviceNode
 from fourbar_ros.ros.messages import create_steady_timer, RELIABLE, ThrottledLog, write_stamp
@@ -55,13 +56,9 @@ SETTLE_NS = 500_000_000
 # Stamp in a serialized message with a header: it follows four bytes of encapsulation.
 SERIALIZED_STAMP = struct.Struct('<4xiI')
 
-# Command timeout of the simulated table [s]. Programs that start on a shared computer delay the
-# nodes by several tenths of a second, and no hardware can be harmed meanwhile.
-COMMAND_TIMEOUT_S = 1.0
-
 _TABLE, *_OTHERS = table_parameters('ideal')
 PARAMETERS = (
-    *(replace(row, default=COMMAND_TIMEOUT_S) if row.name == 'command_timeout' else row
+    *(replace(row, default=PlantSettings.command_timeout) if row.name == 'command_timeout' else row
       for row in device_parameters('paper')),
     _TABLE,
     Setting('clock', 'realtime', '', 'clock that the ticks follow',
