@@ -176,7 +176,7 @@ def test_messages_of_unknown_types_are_copied_with_their_definitions(
 
 # Suites and settings
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_namespace_selects_one_of_two_suites(
         synthetic, loop_messages, same, refuses, tmp_path):
     both = {f'{space}{topic}': entries for space in ('/table1', '/lab/table2')
@@ -196,7 +196,7 @@ def test_namespace_selects_one_of_two_suites(
     assert stored(bag, other) == stored(tmp_path / 'new', other)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_only_suite_is_found_in_its_namespace(synthetic, loop_messages, tmp_path):
     bag = synthetic.write_bag(tmp_path / 'bag', {
         f'/lab{topic}': entries for topic, entries in loop_messages.items()})
@@ -211,7 +211,7 @@ def test_mechanism_is_that_of_the_device_unless_it_is_given(loop_bag, same, tmp_
     assert not compare(found).identical
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_settings_have_an_effect(loop_bag, tmp_path):
     """With ten times the assumed noise, the NIS is a hundred times smaller."""
     found = numbers(loop_bag, tmp_path / 'new', angle_noise=0.017453, counts_per_turn=0)

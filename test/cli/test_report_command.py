@@ -36,7 +36,7 @@ def test_files_are_beside_the_bag(bag):
     assert not list(bag.glob('*.html'))
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_files_are_written_to_the_given_paths(bag, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(['report', str(bag), '-o', 'a.html', '--metrics', 'b.json',

@@ -531,7 +531,7 @@ others = st.sampled_from(
     ['arm', 'arm', 'fail', 'fail', 'reset', 'disarm', 'stop', 'silence', 'old command'])
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @settings(deadline=None, max_examples=400, derandomize=True)
 @example(action='hold_speed', events=[('tick', 30.0), ('disarm', None), ('tick', 1.0)])
 @given(

@@ -180,7 +180,7 @@ def chi_square_mean(freedom: int, count: int) -> tuple[float, float]:
     return low / count, high / count
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_nis_is_chi_square_of_four(consistency: Consistency) -> None:
     low, high = chi_square_mean(4, RUNS * TICKS)
     assert low < consistency.nis.mean() < high

@@ -27,7 +27,7 @@ def test_samples_are_those_of_the_table(world) -> None:
         assert abs(np.mean(read) - expected) < 5.0 * 1.7453e-3 / np.sqrt(470) + ANGLE_STEP
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_stamps_are_times_of_measurement(world) -> None:
     world.run(4.0)
     world.samples.clear()

@@ -38,7 +38,7 @@ def test_wheels_are_driven_and_measured(world) -> None:
     np.testing.assert_allclose(world.samples[-1].wheels.efforts, 0.0, atol=1e-9)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_speeds_are_followed(world) -> None:
     names = [f'flywheel_{letter}' for letter in 'abcd']
 
@@ -65,7 +65,7 @@ def test_safety_rules_apply_with_odrives(world, kind, state) -> None:
     assert world.testbed.arming.reason.startswith('link_d: ')
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_emergency_stop_holds_the_drivers_too(world) -> None:
     world.torque(*TORQUE)
     assert world.arm()[0]

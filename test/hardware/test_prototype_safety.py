@@ -167,7 +167,7 @@ def test_diagnostics_list_the_faults_of_a_link_by_severity(driven) -> None:
                   'link_c: hot: temperature 90 deg C, limit 65 deg C'}
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize('seconds', [1.0, 10.0])
 def test_after_a_bus_failure_wheels_coast_until_armed(driven, seconds) -> None:
     emulator = driven.wire.emulators[0]
@@ -346,7 +346,7 @@ def test_repeated_heartbeats_are_rejected(driven) -> None:
     assert 'link_b: heartbeat_lost: ' in driven.testbed.arming.reason
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_heartbeats_are_accepted_after_a_long_silence(driven) -> None:
     """The durations give different sequence numbers of the first heartbeat after the silence."""
     for seconds in (1.2, 1.25, 1.3, 1.4, 1.6):

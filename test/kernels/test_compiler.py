@@ -183,7 +183,7 @@ def test_kernels_run_without_a_writable_folder(run):
     assert len(result['notes']) == 1 and 'every start compiles' in result['notes'][0]
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_old_folders_are_removed_and_others_kept(run, tmp_path):
     cache = tmp_path / 'home' / '.cache' / 'fourbar_ros'
     long_ago = 1.6e9

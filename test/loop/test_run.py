@@ -53,7 +53,7 @@ def test_preset_completes_its_quarter_turn(name: str) -> None:
     assert np.isnan(found[f'flywheel_command.{left_out}'][100:]).all()
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize('heading', ['link_a', 'link_d'])
 def test_prototype_with_joint_encoders_and_one_heading(heading: str) -> None:
     """The estimate of the turn is as accurate with sensors of the other kind."""

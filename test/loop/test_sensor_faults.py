@@ -100,7 +100,7 @@ def test_wheels_alone_drive_the_estimate_for_a_second_until_it_is_lost(
     assert not loop.supervisor.arming.armed
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_no_sensor_is_reported_without_a_fault(scenario: Scenario) -> None:
     """Without a fault no sensor is reported; a hundred runs are in `study consistency`."""
     for seed in range(2):

@@ -128,7 +128,7 @@ def test_degraded_wheel_is_isolated_and_keeps_its_power(
     assert story.powered.all()
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize('command', COMMANDS)
 @pytest.mark.parametrize('at', [2.4, 6.4])
 def test_runaway_wheel_is_cut_within_0_2_s(at: float, command: str, scenario: Scenario) -> None:
@@ -140,7 +140,7 @@ def test_runaway_wheel_is_cut_within_0_2_s(at: float, command: str, scenario: Sc
     assert story.final <= 1.0
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize('command', COMMANDS)
 def test_shorted_wheel_stops_the_manoeuvre(
     command: str, scenario: Scenario,
@@ -151,7 +151,7 @@ def test_shorted_wheel_stops_the_manoeuvre(
     assert 'flywheel_d' in story.problem
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize('command', COMMANDS)
 def test_one_wheel_of_each_pair_completes_the_manoeuvre(command: str, scenario: Scenario) -> None:
     story = run(scenario, command, 4.0, Fault('flywheel_a', 'dead'), Fault('flywheel_b', 'stuck'))
@@ -160,7 +160,7 @@ def test_one_wheel_of_each_pair_completes_the_manoeuvre(command: str, scenario: 
     assert story.final <= LARGEST_FINAL_ERROR
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize('command', COMMANDS)
 def test_lost_axis_is_named_and_the_other_one_is_held(command: str, scenario: Scenario) -> None:
     story = run(scenario, command, 4.0, Fault('flywheel_a', 'dead'), Fault('flywheel_c', 'dead'))
@@ -187,7 +187,7 @@ def test_no_wheel_fault_with_wrong_inertias(command: str, scenario: Scenario) ->
         assert story.final < 0.1, f'seed {seed}'
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize('command', COMMANDS)
 def test_device_that_does_not_drive_is_no_fault_of_its_wheels(
     command: str, scenario: Scenario,

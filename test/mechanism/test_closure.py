@@ -254,7 +254,7 @@ def test_angles_worked_out_lie_in_one_turn(phi_a: float, phi_b: float, branch: s
     assert -pi < angles[3] <= pi
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @given(drawn=assembled(), turn=st.floats(-20.0, 20.0), change=st.floats(-0.02, 0.02))
 @repeatable
 def test_path_is_followed_as_step_by_step(

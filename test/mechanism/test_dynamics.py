@@ -219,7 +219,7 @@ def test_accelerations_are_finite_at_a_change_point(
 
 # --- An independent derivation ----------------------------------------------------------------
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', SEEDS)
 def test_accelerations_agree_with_an_independent_model(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],

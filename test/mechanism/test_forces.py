@@ -383,7 +383,7 @@ def test_stiff_joints_approach_rigid_ones(
 
 # --- An independent derivation ----------------------------------------------------------------
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', range(40))
 def test_accelerations_agree_with_an_independent_model(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],

@@ -41,6 +41,7 @@ def test_every_executable_is_where_ros2_run_looks(folder, executables):
     assert all(os.access(path, os.X_OK) for path in folder.iterdir())
 
 
+@pytest.mark.slow
 def test_every_executable_has_help(workspace, folder, executables, check_help):
     names = [*executables, 'fourbar']
     check_help(*SOURCED, folder=folder, names=names, cwd=workspace, PATH=PATH)

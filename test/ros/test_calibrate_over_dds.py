@@ -118,6 +118,7 @@ def test_interrupt_leaves_the_wheels_without_torque(start, plant):
     check_left_without_torque(plant)
 
 
+@pytest.mark.slow
 def test_command_ends_without_a_recording_near_a_change_point(
         start, plant, tmp_path):
     bag, parameter = tmp_path / 'bag', Parameter(name='initial.link_b')

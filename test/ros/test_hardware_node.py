@@ -456,6 +456,7 @@ def test_truth_agrees_with_link_angles_within_their_noise(bench):
         assert np.abs(errors).max() < 6 * 1.7453e-3
 
 
+@pytest.mark.slow
 def test_emulator_reports_once_that_the_linkage_met_the_edge_of_the_table(
         suite, make_probe, tmp_path):
     """The table of the test is steep and narrow, so that the linkage slides to its edge."""

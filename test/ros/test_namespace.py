@@ -59,6 +59,7 @@ def test_loop_in_a_namespace_has_no_effect_on_the_other_one(labs):
     assert other.more('sim/link_states')[0].position[0] == pytest.approx(1.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_nodes_follow_remapping(suite, make_probe):
     suite.node('plant', arguments=('-r', 'flywheel_states:=wheels', '-r', '__node:=table'))
     probe = make_probe()

@@ -18,7 +18,9 @@ pytestmark = pytest.mark.node
 # Time limit for the end of a node: two seconds, and a margin for a busy machine [s].
 SHUTDOWN_S = 2.0 + 3.0
 SIGNALS = pytest.mark.parametrize(
-    'number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+    'number', [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
+               pytest.param(signal.SIGHUP, marks=pytest.mark.slow)],
+    ids=lambda number: number.name)
 
 
 @SIGNALS

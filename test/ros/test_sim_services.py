@@ -24,7 +24,8 @@ def distinct(messages):
     return list(dict.fromkeys(stamps(messages)))
 
 
-@pytest.fixture(scope='module', params=['realtime', 'fast', 'lockstep'])
+@pytest.fixture(scope='module', params=[
+    'realtime', pytest.param('fast', marks=pytest.mark.slow), 'lockstep'])
 def testbed(request, module_suite, make_probe):
     """Run a plant in each clock mode, its wheels driven by the probe."""
     namespace = f'/{request.param}'

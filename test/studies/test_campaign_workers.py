@@ -68,7 +68,7 @@ def singles(items: list[Any]) -> list[list[Any]]:
     return [[item] for item in items]
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_results_come_in_the_order_of_the_items(imported: Callable[[str], Any]) -> None:
     assert list(map_ordered(abs, [-3, 2, -1], 2)) == [3, 2, 1]
     assert list(map_ordered(abs, [-3], 2)) == [3]
@@ -139,7 +139,7 @@ def test_interrupt_while_processes_start_is_not_lost() -> None:
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_interrupt_of_all_processes_ends_them_without_output(
         wait_until: Callable[[Callable[[], Any], str], None]) -> None:
     # A process in the background of a shell ignores interrupts.

@@ -99,7 +99,7 @@ def test_least_at_a_weight_is_that_of_finite_elements(weight: float) -> None:
         TURN * np.sqrt(trapezoid((phi - reference) ** 2, s)), rel=1e-4)
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_equal_pairs_are_the_best() -> None:
     """The root of the least eq. 9 is convex in the squared error, so equal errors are best."""
     errors = np.radians(np.linspace(0.05, 20.0, 60))

@@ -101,7 +101,7 @@ def test_device_that_disarms_is_a_failure() -> None:
     assert row['failure'] and not row['armed_at_end']
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_only_is_bit_identical_and_its_scenario_runs_anywhere(
     campaign_file: Callable[..., str], tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:

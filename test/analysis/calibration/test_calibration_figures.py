@@ -16,7 +16,7 @@ from fourbar_ros.plotting.style import render
 import pytest
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_wheels_are_drawn(prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
     signals = excited(prototype, lab, SpinAndCoast(prototype, [0], 60.0, 0.02, 3.0), 0)
     estimates = [wheel_estimate(0, *signals)]

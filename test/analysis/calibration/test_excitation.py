@@ -58,7 +58,7 @@ def test_first_direction_leads_away_from_change_points(
     assert change_point_margin(links.angles[known][-1]) > change_point_margin(angles) + 0.02
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_multi_sine_keeps_the_limit_and_does_not_drift(
         prototype: Mechanism, lab: Table, make_bed: Callable[..., Any]) -> None:
     """Links oscillate about their initial angles; seed 0."""

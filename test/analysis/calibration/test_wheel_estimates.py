@@ -49,7 +49,7 @@ def test_truth_is_found_to_one_percent_and_covered(
     assert covered >= binom.ppf(1e-3, 3 * len(SEEDS), 0.95), 'seeds 0-9'
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_all_wheels_one_after_the_other(
         prototype: Mechanism, lab: Table, excited: Callable[..., Any]) -> None:
     """The friction for the controller is the mean; seed 7."""
