@@ -103,7 +103,7 @@ COMMAND = QoSProfile(depth=10)
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 # Nodes end in this order, so that no node reports the silence of another one.
-STOP_ORDER = ('controller', 'estimator', 'plant', 'hardware', 'prototype_emulator')
+STOP_ORDER = ('record', 'controller', 'estimator', 'plant', 'hardware', 'prototype_emulator')
 
 # Processes of each kind of device; the last one has the topics.
 DEVICES = {'plant': ('plant',), 'hardware': ('prototype_emulator', 'hardware')}
