@@ -55,7 +55,7 @@ TABLE = (
 )
 
 # Command timeout of the device [s], longer than by default: a loaded laptop delays the nodes.
-COMMAND_TIMEOUT_S = 1.0
+COMMAND_TIMEOUT_S = 3.0
 # Time to discover another device [s].
 DISCOVERY_S = 0.5
 # Longest time until all nodes exchange messages [s].
