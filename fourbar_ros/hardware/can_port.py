@@ -98,6 +98,7 @@ class Port:
         """
         state = self._error_state
         if self._bus is not None:
+            # Some interfaces of python-can report no state.
             with suppress(NotImplementedError, *self._driver_errors):
                 state = self._bus_states.get(self._bus.state, state)
         if state is None and self.errors:

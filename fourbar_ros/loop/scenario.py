@@ -11,7 +11,7 @@ duration and the seed of all random numbers (docs/scenarios.md). Equal scenarios
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 import logging
 from math import floor
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 from fourbar_ros.common.config_files import config_file, load_yaml
 from fourbar_ros.common.errors import FourbarError
-from fourbar_ros.common.settings import check_keys, Setting, setting, SettingError, settings_of
+from fourbar_ros.common.settings import check_keys, Setting, SettingError, settings_of
 from fourbar_ros.control import ControllerSettings
 from fourbar_ros.control.settings import SETTINGS as CONTROLLER
 from fourbar_ros.device import SupervisorSettings
@@ -35,6 +35,8 @@ LONGEST_RUN = 3600.0
 OLD_MODEL_KEY = 'believed'
 
 _STEP, _SEED = settings_of(SimulationSettings)
+_COMMAND_TIMEOUT, = (row for row in settings_of(SupervisorSettings)
+                     if row.name == 'command_timeout')
 _DURATION = Setting('duration', 0.0, 's', 'time from the first tick to the last',
                     low=1e-6, high=LONGEST_RUN)
 _ANGLE = Setting('', 0.0, 'rad', 'orientation of a link, or change of it', low=-1e6, high=1e6)
@@ -53,8 +55,8 @@ class PlantSettings(SupervisorSettings):
 
     # Programs that start on a shared computer delay nodes by several tenths of a second, and no
     # hardware can be harmed meanwhile.
-    command_timeout: float = setting(
-        1.0, 's', 'longest time without a command while armed', low=0.002, high=10.0)
+    command_timeout: float = field(
+        default=1.0, metadata={'setting': replace(_COMMAND_TIMEOUT, default=1.0)})
     step: float = field(default=_STEP.default, metadata={'setting': _STEP})
 
 

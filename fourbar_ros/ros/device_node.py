@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 import time
 from typing import Any
@@ -56,7 +57,7 @@ def device_parameters(mechanism: str) -> tuple[Setting, ...]:
     )
 
 
-class DeviceNode(BaseNode):
+class DeviceNode(BaseNode, ABC):
     """
     Advance a device tick by tick, and pass commands on while it is armed.
 
@@ -93,9 +94,9 @@ class DeviceNode(BaseNode):
         self.logger.info(
             f'{device.description} with mechanism {values["mechanism"]} at {values["rate"]:g} Hz')
 
+    @abstractmethod
     def make_device(self) -> Device:
         """Return the device that the parameters describe."""
-        raise NotImplementedError
 
     def make_clock_mode(self) -> tuple[ClockMode, int]:
         """Return the clock that ticks follow, and the period of polling it [ns]."""

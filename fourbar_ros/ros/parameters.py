@@ -83,7 +83,7 @@ def _markdown_line(rows: Sequence[Setting]) -> str:
         allowed = ', '.join(f'`{choice}`' for choice in row.choices)
     elif row.limits is not None:
         # Whole numbers in full, but the largest seed, 2^63 - 1.
-        low, high = (f'{limit:.9g}' for limit in row.limits)
+        low, high = (f'{limit:.10g}' for limit in row.limits)
         allowed = f'{low} to {high}'
     default = '' if row.default == '' else f'`{row.default}`'
     return (f'| {", ".join(f"`{each.name}`" for each in rows)} | {default} | {row.unit} | '
