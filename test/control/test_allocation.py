@@ -550,7 +550,7 @@ def test_demand_is_reduced_before_torques_grow() -> None:
     assert seen == {0.0, 1.0, 2.0}      # lost, weak and good
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.parametrize('kind', ['proportional', 'bounded', 'min_max_speed'])
 def test_torques_are_finite_and_within_bounds_for_any_problem(kind: str) -> None:
     """Cases: dependent rows, zero demand, empty bounds, no wheels, unequal sizes; seed 5."""

@@ -148,7 +148,8 @@ def test_shorted_wheel_stops_the_manoeuvre(
     story = run(scenario, command, 3.0, Fault('flywheel_d', 'shorted'))
     assert story.named['flywheel_d']['shorted'] < 0.5
     assert story.mode == 'damp'
-    assert 'flywheel_d' in story.problem
+    for part in ('flywheel_d', 'power cannot be cut', 'press the emergency stop'):
+        assert part in story.problem
 
 
 @pytest.mark.slow
@@ -164,7 +165,8 @@ def test_one_wheel_of_each_pair_completes_the_manoeuvre(command: str, scenario: 
 @pytest.mark.parametrize('command', COMMANDS)
 def test_lost_axis_is_named_and_the_other_one_is_held(command: str, scenario: Scenario) -> None:
     story = run(scenario, command, 4.0, Fault('flywheel_a', 'dead'), Fault('flywheel_c', 'dead'))
-    assert 'flywheel_a, flywheel_c' in story.problem
+    for part in ('axis a cannot', 'flywheel_a, flywheel_c'):
+        assert part in story.problem
     assert story.mode == 'hold'
     assert story.off_b < 1.0
 

@@ -107,10 +107,10 @@ def test_wheel_missing_in_a_command_loses_its_power(kind, cut, testbed):
 
 
 @pytest.mark.parametrize(('name', 'text', 'word'), [
-    ('fault.link_a', 'broken', 'broken'),
-    ('fault.link_a', 'intermittent 1.5', '1.5'),
+    ('fault.link_a', 'broken', "unknown fault 'broken' of link_a"),
+    ('fault.link_a', 'intermittent 1.5', 'between 0 and 1, got 1.5'),
     ('fault.joint_1', 'off', 'no joint_1'),
-    ('fault.flywheel_a', 'weak x', "'x'"),
+    ('fault.flywheel_a', 'weak x', "must be a number, got 'x'"),
     ('fault_schedule', '/nowhere/faults.yaml', '/nowhere/faults.yaml')])
 def test_invalid_fault_is_refused_and_has_no_effect(testbed, name, text, word):
     accepted, reason = set_fault(testbed, name, text)
