@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import exp, pi, sin
+from typing import NamedTuple
 
 from fourbar_ros.control.actuation_cost_sums import ActuationCostSums, MAX_PERIOD
 from fourbar_ros.control.branch import Branch, PARALLELOGRAM
@@ -20,7 +20,7 @@ from fourbar_ros.control.feasibility import (
     Wheels,
 )
 from fourbar_ros.control.momentum_margin import MomentumMonitor
-from fourbar_ros.control.reference_generator import ReferenceGenerator
+from fourbar_ros.control.reference_generator import ReferenceGenerator, set_pairs
 from fourbar_ros.control.setpoint import check_names, follow_path, SetpointError
 from fourbar_ros.control.settings import ControllerSettings
 from fourbar_ros.control.soft_step import SoftStep, TrajectorySegment
@@ -65,8 +65,7 @@ DRIFT_HORIZON = 60.0
 ALL = np.ones(4, dtype=bool)
 
 
-@dataclass(frozen=True, eq=False)
-class Control:
+class Control(NamedTuple):
     """
     Output of the controller at a tick.
 
@@ -510,7 +509,7 @@ class Controller:
         self._commander.update_friction(none, 0.0, 0.0)
         self._cost.add(0.0, none, none, none)
         step = SoftStep(np.zeros((3, 2)), np.zeros(2), 1.0)
-        step.at(0.5)
+        set_pairs(step.at(0.5), PARALLELOGRAM.paired_links, np.zeros(2), np.zeros((3, 4)))
         # Not by `check_needs`: not every linkage closes with all angles the same.
         times = step.instants(2)
         branch = self._reference.branch or PARALLELOGRAM

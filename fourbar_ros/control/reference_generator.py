@@ -8,10 +8,12 @@ from __future__ import annotations
 from fourbar_ros.control.branch import Branch, branch_at
 from fourbar_ros.control.setpoint import follow_path, SetpointError
 from fourbar_ros.control.soft_step import SoftStep, TrajectorySegment
+from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism import Mechanism, nearest_assembly
 from fourbar_ros.mechanism.constants import Array
 from fourbar_ros.mechanism.dynamics import gamma_matrix
 import numpy as np
+from numpy.typing import NDArray
 
 # Time in which an aborted move comes to rest [s]; less near a change point.
 STOPPING_TIME = 1.0
@@ -25,18 +27,19 @@ class ReferenceGenerator:
     Generates the reference of all four links.
 
     :param mechanism: the model of the linkage.
-    :ivar angles: (4,) continuous [rad].
-    :ivar rates: (4,) [rad/s].
-    :ivar accelerations: (4,) of the axes exactly; of the other links without the part that their
-        changing gearing adds [rad/s^2].
+    :ivar links: (3, 4) angles, continuous [rad], rates [rad/s] and accelerations [rad/s^2] of the
+        links; changed in place. Accelerations of links besides the axes are without the part that
+        their changing gearing adds.
+    :ivar angles, rates, accelerations: (4,) the rows of `links`.
     :ivar goal: (4,) end of the last accepted move, None without one [rad].
     :ivar branch: branch on which links turn in pairs; None where they do not.
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
-        self.angles = np.zeros(4)
-        self.rates = np.zeros(4)
-        self.accelerations = np.zeros(4)
+        self.links = np.zeros((3, 4))
+        self.angles: Array = self.links[0]
+        self.rates: Array = self.links[1]
+        self.accelerations: Array = self.links[2]
         self.goal: Array | None = None
         self.branch: Branch | None = None
         self._mechanism = mechanism
@@ -73,7 +76,9 @@ class ReferenceGenerator:
     @property
     def destination(self) -> Array:
         """Link angles at the end of the move, or now (4,) [rad]."""
-        return self.angles if self._segment is None or self.goal is None else self.goal
+        if self._segment is None or self.goal is None:
+            return np.array(self.angles)
+        return self.goal
 
     def rest_at(self, angles: Array, *, any_branch: bool = False) -> None:
         """
@@ -154,7 +159,7 @@ class ReferenceGenerator:
         if self.branch is None:
             self._update_links()
         else:
-            self._update_pairs(self.branch)
+            set_pairs(self._motion, self.branch.paired_links, self._offsets, self.links)
         if elapsed >= segment.duration:
             self._segment = None
             return True
@@ -167,10 +172,10 @@ class ReferenceGenerator:
 
     def _rest_on(self, branch: Branch | None, angles: Array) -> None:
         self.branch = branch
-        self.angles = np.array(angles)
+        self.angles[:] = angles
         if branch is not None:
             # Whole turns are kept.
-            self.angles = branch.nearest(self.angles)
+            self.angles[:] = branch.nearest(self.angles)
             self._offsets = branch.offsets(self.angles)
         self._set_axes(self.angles)
 
@@ -181,18 +186,30 @@ class ReferenceGenerator:
         self._motion[1:] = 0.0
         self.rates[:] = self.accelerations[:] = 0.0
 
-    def _update_pairs(self, branch: Branch) -> None:
-        for axis, (first, second) in enumerate(branch.pairs):
-            for row, values in enumerate((self.angles, self.rates, self.accelerations)):
-                values[first] = values[second] = self._motion[row, axis]
-            self.angles[second] += self._offsets[axis]
-
     def _update_links(self) -> None:
         motion = self._motion
-        self.angles = nearest_assembly(
+        self.angles[:] = nearest_assembly(
             self._mechanism, (0, 1), (motion[0, 0], motion[0, 1]), self.angles)
         # A planned move keeps its distance from change points, so Gamma exists here.
         gamma = gamma_matrix(self.angles, self._mechanism.link_lengths)
         for values, of_axes in ((self.rates, motion[1]), (self.accelerations, motion[2])):
             values[:2] = of_axes
             values[2:] = gamma @ of_axes
+
+
+@kernel
+def set_pairs(motion: Array, paired_links: NDArray[np.int64], offsets: Array, links: Array
+              ) -> None:
+    """
+    Set the motion of links that turn in pairs to that of the two axes, in place.
+
+    :param motion: (3, 2) angles, rates and accelerations of the axes [rad, rad/s, rad/s^2].
+    :param paired_links: (4,) first links of both pairs, then second links.
+    :param offsets: (2,) angles of second links relative to first links [rad].
+    :param links: (3, 4) the same of the links.
+    """
+    for axis in range(2):
+        first, second = paired_links[axis], paired_links[axis + 2]
+        for row in range(3):
+            links[row, first] = links[row, second] = motion[row, axis]
+        links[0, second] += offsets[axis]

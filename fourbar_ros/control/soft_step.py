@@ -28,14 +28,16 @@ def evaluate(coefficients: Array, time: float, duration: float) -> Array:
     :returns: (3, axes).
     """
     s = time / duration
-    values = np.zeros((3, coefficients.shape[1]))
-    # Horner's rule, which also gives half the second derivative.
-    for power in range(5, -1, -1):
-        values[2] = values[2] * s + values[1]
-        values[1] = values[1] * s + values[0]
-        values[0] = values[0] * s + coefficients[power]
-    values[1] /= duration
-    values[2] *= 2.0 / (duration * duration)
+    values = np.empty((3, coefficients.shape[1]))
+    for axis in range(coefficients.shape[1]):
+        # Horner's rule, which also gives half the second derivative.
+        angle = slope = half_bend = 0.0
+        for power in range(5, -1, -1):
+            half_bend = half_bend * s + slope
+            slope = slope * s + angle
+            angle = angle * s + coefficients[power, axis]
+        values[0, axis], values[1, axis] = angle, slope / duration
+        values[2, axis] = half_bend * (2.0 / (duration * duration))
     return values
 
 

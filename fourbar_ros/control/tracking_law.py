@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from fourbar_ros.control.allocation import Allocation, make_allocation
 from fourbar_ros.control.allocation_solver import allocate, controllable, MotorState
-from fourbar_ros.control.branch import UNPAIRED_AXES
+from fourbar_ros.control.branch import Branch, UNPAIRED_AXES
 from fourbar_ros.control.computed_torque import (
     AXES_FIELDS,
     demanded,
@@ -91,11 +91,12 @@ class LawOutput:
         self.planned: Array = self.records['planned'][0]
         self.lower: Array = self.records['lower'][0]
         self.upper: Array = self.records['upper'][0]
+        self._scale: Array = self.records['scale']
 
     @property
     def scale(self) -> float:
         """Share of the demand that the motors can meet."""
-        return float(self.records['scale'][0])
+        return float(self._scale.item())
 
 
 @kernel
@@ -183,6 +184,26 @@ def _track(inputs: NDArray[np.record], gains: NDArray[np.record], rule: NDArray[
           output[0])
 
 
+@kernel
+def _fill_inputs(packed: NDArray[np.record], reference: Array, angles: Array, rates: Array,
+                 disturbance: Array, wheel_speeds: Array, friction: Array, sticking: float
+                 ) -> None:
+    """
+    Fill the inputs except the pairs and the target speeds.
+
+    :param packed: (1,) of `INPUT_FIELDS`.
+    :param reference: (3, 4) see `ReferenceGenerator.links`.
+    """
+    inputs = packed[0]
+    for j in range(4):
+        inputs.angles[j], inputs.rates[j] = angles[j], rates[j]
+        inputs.reference_angles[j], inputs.reference_rates[j] = reference[0, j], reference[1, j]
+        inputs.reference_accelerations[j] = reference[2, j]
+        inputs.wheel_speeds[j], inputs.bearing_friction[j] = wheel_speeds[j], friction[j]
+    inputs.disturbance[0], inputs.disturbance[1] = disturbance[0], disturbance[1]
+    inputs.sticking = sticking
+
+
 class TrackingLaw:
     """
     The law with its gains and records.
@@ -204,7 +225,10 @@ class TrackingLaw:
         self._motors = np.array([motors_of(mechanism)])
         self._gains = records(GAIN_FIELDS)
         self._inputs = records(INPUT_FIELDS)
-        self._fields = {name: self._inputs[name][0] for name, _, shape in INPUT_FIELDS if shape}
+        self._paired_links: NDArray[np.int64] = self._inputs['paired_links'][0]
+        self._target_speeds: Array = self._inputs['target_speeds'][0]
+        self._branch: Branch | None
+        self._set_branch(None)
         self._plan_rule: NDArray[np.record]
         self._target = 'free'
         self._bias = 0.0
@@ -221,6 +245,7 @@ class TrackingLaw:
         self.motor_share = MOTOR_SHARE[settings.command]
         self.usable = usable
         self._target, self._bias = settings.wheel_target, settings.wheel_bias
+        self._target_speeds[:] = 0.0
         self._gains[0] = (
             settings.bandwidth ** 2, 2.0 * settings.damping * settings.bandwidth,
             settings.rest_band, settings.disturbance_compensation, settings.branch_bandwidth ** 2,
@@ -242,19 +267,12 @@ class TrackingLaw:
         :param sticking: from 0, in motion, to 1, at rest; see `computed_torque.Feedback`.
         :returns: the output, whose arrays are overwritten at the next tick.
         """
-        branch, fields = reference.branch, self._fields
-        fields['angles'][:], fields['rates'][:] = angles, rates
-        fields['reference_angles'][:] = reference.angles
-        fields['reference_rates'][:] = reference.rates
-        fields['reference_accelerations'][:] = reference.accelerations
-        fields['disturbance'][:] = disturbance
-        fields['wheel_speeds'][:], fields['bearing_friction'][:] = wheel_speeds, friction
-        fields['paired_links'][:] = UNPAIRED_AXES if branch is None else branch.paired_links
+        _fill_inputs(self._inputs, reference.links, angles, rates, disturbance, wheel_speeds,
+                     friction, sticking)
+        if reference.branch is not self._branch:
+            self._set_branch(reference.branch)
         if self._target in ('zero', 'bias'):
-            fields['target_speeds'][:] = target_speeds(self._target, rates, self._bias)
-        else:
-            fields['target_speeds'][:] = 0.0
-        self._inputs['paired'], self._inputs['sticking'] = reference.paired, sticking
+            self._target_speeds[:] = target_speeds(self._target, rates, self._bias)
         _track(self._inputs, self._gains, self.allocation.rule, self._plan_rule, self._constants,
                self._motors, self.output.axes_records, self.output.records)
         return self.output
@@ -262,8 +280,7 @@ class TrackingLaw:
     @property
     def axes(self) -> NDArray[np.int64]:
         """Links that the axes of the last tick are named after (2,)."""
-        axes: NDArray[np.int64] = self._fields['paired_links'][:2]
-        return axes
+        return self._paired_links[:2]
 
     def lost_axes(self) -> list[str]:
         """Return the names of the axes that the wheels cannot drive."""
@@ -271,3 +288,8 @@ class TrackingLaw:
             self.output.axes.wheel_map[:2], self.allocation.weights_inv)
         return [AXES[self.axes[int(np.argmax(np.abs(direction)))]]
                 for direction, share in zip(directions, shares) if share < 1.0]
+
+    def _set_branch(self, branch: Branch | None) -> None:
+        self._branch = branch
+        self._inputs['paired'] = branch is not None
+        self._paired_links[:] = UNPAIRED_AXES if branch is None else branch.paired_links

@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import copysign
+from typing import NamedTuple
 
 from fourbar_ros.kernels.compiler import kernel
 from fourbar_ros.mechanism import FLYWHEEL_NAMES, Mechanism
@@ -27,8 +27,7 @@ SPEED_REACH = 0.8
 FRICTION_SPEED = 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class WheelCommand:
+class WheelCommand(NamedTuple):
     """
     Command to the wheels.
 
@@ -83,8 +82,8 @@ class WheelCommander:
         """
         if not by_speed:
             self._speeds[:] = speeds
-            values = np.clip(torques + self.friction, -self._limits, self._limits)
-            return WheelCommand(values, False, powered)
+            return WheelCommand(
+                motor_torques(torques, self.friction, self._limits), False, powered)
         next_speeds(self._speeds, torques, link_accelerations, speeds, powered, period,
                     self._inertias, self._reach)
         return WheelCommand(self._speeds.copy(), True, powered)
@@ -111,6 +110,15 @@ def bearing_friction(speeds: Array, coulomb: float, viscous: float, friction: Ar
     for j in range(4):
         sign = copysign(min(abs(speeds[j]) / FRICTION_SPEED, 1.0), speeds[j])
         friction[j] = coulomb * sign + viscous * speeds[j]
+
+
+@kernel
+def motor_torques(torques: Array, friction: Array, limits: Array) -> Array:
+    """Add the friction that the motors must overcome, within their limits (4,) [N m]."""
+    commanded = np.empty(4)
+    for j in range(4):
+        commanded[j] = min(max(torques[j] + friction[j], -limits[j]), limits[j])
+    return commanded
 
 
 @kernel

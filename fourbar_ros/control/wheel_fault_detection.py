@@ -218,7 +218,6 @@ class WheelFaultDetector:
         self.usable = np.ones(4, dtype=bool)
         self._motors = np.array([motors_of(mechanism)])
         self._sample = records(SAMPLE_FIELDS)
-        self._fields = {name: self._sample[name][0] for name, _, shape in SAMPLE_FIELDS if shape}
         self._wheels = records(WHEEL_FIELDS, 4)
         self._started = False
 
@@ -281,11 +280,20 @@ class WheelFaultDetector:
 
     def _fill(self, period: float, command: WheelCommand, speeds: Array, link_rates: Array,
               efforts: Array) -> None:
-        fields = self._fields
-        self._sample['period'], self._sample['by_speed'] = period, command.by_speed
-        fields['commands'][:], fields['powered'][:] = command.values, command.powered
-        fields['speeds'][:], fields['link_rates'][:] = speeds, link_rates
-        fields['efforts'][:] = efforts
+        _fill_sample(self._sample, period, command.values, command.by_speed, command.powered,
+                     speeds, link_rates, efforts)
+
+
+@kernel
+def _fill_sample(samples: NDArray[np.record], period: float, commands: Array, by_speed: bool,
+                 powered: NDArray[np.bool_], speeds: Array, link_rates: Array, efforts: Array
+                 ) -> None:
+    sample = samples[0]
+    sample.period, sample.by_speed = period, by_speed
+    for j in range(4):
+        sample.commands[j], sample.powered[j] = commands[j], powered[j]
+        sample.speeds[j], sample.link_rates[j], sample.efforts[j] = (
+            speeds[j], link_rates[j], efforts[j])
 
 
 @kernel

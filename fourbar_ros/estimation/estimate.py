@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from fourbar_ros.mechanism.constants import Array
@@ -43,6 +42,7 @@ class Innovation(NamedTuple):
     :param statuses: (m,) status of each sample: ACCEPTED, GATED or EXCLUDED.
     :param nis: NIS of the accepted samples together, chi-square of as many degrees of freedom for
         a consistent filter.
+    :param degrees_of_freedom: number of accepted samples.
     """
 
     sensors: tuple[int, ...]
@@ -50,6 +50,7 @@ class Innovation(NamedTuple):
     sample_nis: Array
     statuses: NDArray[np.int64]
     nis: float
+    degrees_of_freedom: int
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -57,14 +58,8 @@ class Innovation(NamedTuple):
         used: NDArray[np.bool_] = self.statuses == ACCEPTED
         return used
 
-    @property
-    def degrees_of_freedom(self) -> int:
-        """Number of accepted samples."""
-        return int(self.used.sum())
 
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
+class Estimate(NamedTuple):
     """
     Estimate of the state of the links at a tick, with its uncertainty.
 

@@ -61,7 +61,7 @@ class Snapshot(NamedTuple):
 
     x: Array
     covariance: Array
-    hypotheses: Records
+    hypotheses: Array
     gyros: tuple[int, ...]
 
 
@@ -94,6 +94,8 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         self._gyros: tuple[int, ...] = ()
         self._sensor_rows: dict[tuple[int, ...], Records] = {}
         self._hypotheses = initial_hypotheses()
+        # The same memory as numbers: numpy copies records field by field, and numbers at once.
+        self._hypotheses_memory = self._hypotheses.view(np.uint64)
         self.x = np.zeros(self._first_bias)
         self.x[ANGLES] = angles
         self.P = np.zeros((self._first_bias, self._first_bias))
@@ -158,12 +160,13 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
 
     def snapshot(self) -> Snapshot:
         """Return a copy of what predict and update change."""
-        return Snapshot(self.x.copy(), self.P.copy(), self._hypotheses.copy(), self._gyros)
+        return Snapshot(
+            self.x.copy(), self.P.copy(), self._hypotheses_memory.copy(), self._gyros)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Return to a snapshot."""
         self.x, self.P = snapshot.x.copy(), snapshot.covariance.copy()
-        self._hypotheses = snapshot.hypotheses.copy()
+        self._hypotheses_memory[:] = snapshot.hypotheses
         if snapshot.gyros != self._gyros:
             self._set_gyros(snapshot.gyros)
 
@@ -197,11 +200,13 @@ class LinkageFilter(ExtendedKalmanFilter):  # type: ignore[misc]
         rows = self._sensor_rows.get(sensors)
         if rows is None:
             rows = self._sensor_rows[sensors] = self._make_sensor_rows(sensors)
-        variances = np.empty(len(sensors))
-        variances[:] = variance
+        if isinstance(variance, np.ndarray):
+            variances = variance
+        else:
+            variances = np.full(len(sensors), variance, float)
         self.S, self.SI, self.K, nis, self.y, sample_nis, statuses = update(
             self.x, self.P, self._hypotheses, rows, measured, variances, gate, self._model)
-        return Innovation(sensors, self.y, sample_nis, statuses, nis)
+        return Innovation(sensors, self.y, sample_nis, statuses, nis, len(self.S))
 
     def _start_lengths(self, sigma: float) -> None:
         """

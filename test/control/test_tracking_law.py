@@ -182,7 +182,7 @@ def test_pairs_of_other_branches_have_the_demanded_accelerations(
                               for size in (1.0, 0.05, 2.0))
     reference = reference_at(mechanism, angles, NONE, planned)
     reference.branch = branch
-    reference.angles = angles + behind
+    reference.angles[:] = angles + behind
     found = update(law_of(mechanism, wheel_target='zero'), reference, angles, rates,
                    speeds=rng.uniform(-100.0, 100.0, 4))
     asked = planned - DAMPING * rates + STIFFNESS * behind

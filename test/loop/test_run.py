@@ -230,8 +230,8 @@ def test_command_of_a_wheel_without_power_is_missing_in_the_record() -> None:
     recording = RunRecord(scenario.table.link_sensors.sensor_names)
     for by_speed, step in zip((False, True), steps):
         assert step.control is not None
-        recording.add(replace(step, control=replace(
-            step.control, command=WheelCommand(values, by_speed, powered))))
+        recording.add(replace(step, control=step.control._replace(
+            command=WheelCommand(values, by_speed, powered))))
     found = recording.arrays()
     left = [1.0, np.nan, 3.0, 4.0]
     np.testing.assert_array_equal(found['flywheel_command.effort'], [left, [np.nan] * 4])
