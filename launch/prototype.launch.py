@@ -5,7 +5,7 @@
 Prototype, estimator and controller: `ros2 launch fourbar_ros prototype.launch.py`.
 
 With `emulate:=true` the links are emulated on this machine. The numerical kernels are compiled
-first (some fifteen seconds, once), then the nodes start. They have config/nodes_prototype.yaml.
+first (two minutes, once), then the nodes start. They have config/nodes_prototype.yaml.
 """
 
 from pathlib import Path
@@ -37,6 +37,7 @@ PARAMETERS = {
     'rate': (('hardware',), float),
     'table': ((EMULATOR,), str),
     'setpoint_duration': (('controller',), float),
+    'realtime_priority': (EXECUTABLES, int),
 }
 
 # Where host and emulated links find each other.
@@ -90,6 +91,10 @@ def generate_launch_description():
         DeclareLaunchArgument(
             'setpoint_duration', default_value='',
             description='time in which a setpoint is reached [s], 10.0 unless given'),
+        DeclareLaunchArgument(
+            'realtime_priority', default_value='',
+            description='priority of all nodes under SCHED_FIFO, 1 to 99; 0, unless given, for '
+                        'none'),
         DeclareLaunchArgument(
             'emulate', default_value='false',
             description='true to start emulated links too, on the same bus'),

@@ -4,7 +4,7 @@
 """
 Simulated table, estimator and controller: `ros2 launch fourbar_ros sim.launch.py`.
 
-The numerical kernels are compiled first (some fifteen seconds, once), then the nodes start.
+The numerical kernels are compiled first (two minutes, once), then the nodes start.
 """
 
 from launch import LaunchDescription
@@ -29,6 +29,7 @@ PARAMETERS = {
     'rate': (('plant',), float),
     'seed': (('plant',), int),
     'setpoint_duration': (('controller',), float),
+    'realtime_priority': (EXECUTABLES, int),
 }
 
 
@@ -65,6 +66,10 @@ def generate_launch_description():
         DeclareLaunchArgument(
             'setpoint_duration', default_value='',
             description='time in which a setpoint is reached [s], 10.0 unless given'),
+        DeclareLaunchArgument(
+            'realtime_priority', default_value='',
+            description='priority of all nodes under SCHED_FIFO, 1 to 99; 0, unless given, for '
+                        'none'),
         OpaqueFunction(function=start_nodes),
     ])
 

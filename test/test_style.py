@@ -4,6 +4,7 @@
 """Rules of the source tree: headers, one-way imports, imports of ROS, one version."""
 
 import ast
+import functools
 from graphlib import CycleError, TopologicalSorter
 from importlib.util import resolve_name
 import os
@@ -53,20 +54,24 @@ MAY_IMPORT = {
 ROS = re.compile(r'rclpy|rcl_\w+|rmw\w*|rosidl\w*|ament\w*|launch\w*|tf2\w*|'
                  r'\w+_(msgs|srvs|interfaces)')
 
-each_module = pytest.mark.parametrize(
-    'path', MODULES, ids=[str(path.relative_to(PACKAGE)) for path in MODULES])
-
 
 def room_of(path):
     """Return the room that a module is in."""
     return path.relative_to(PACKAGE).with_suffix('').parts[0]
 
 
+@functools.cache
+def tree_of(path):
+    """Return the syntax tree of a file."""
+    return ast.parse(path.read_text())
+
+
+@functools.cache
 def imports(path):
     """Return the full names of all imports of a file, inside functions too."""
     package = '.'.join(path.relative_to(ROOT).parent.parts)
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -86,25 +91,23 @@ def dependencies():
     return {element.text for element in manifest.findall('exec_depend')}
 
 
-@pytest.mark.medium
-@pytest.mark.parametrize('path', SOURCES, ids=[str(path.relative_to(ROOT)) for path in SOURCES])
-def test_file_has_copyright_header_and_docstring(path):
-    lines = path.read_text().splitlines()
-    if lines[0].startswith('#!'):
-        del lines[0]
-    assert lines[:2] == HEADER
-    assert ast.get_docstring(ast.parse(path.read_text()))
+def test_every_file_has_copyright_header_and_docstring():
+    heads = {path: path.read_text().splitlines()[:3] for path in SOURCES}
+    assert [path for path, lines in heads.items()
+            if lines[int(lines[0].startswith('#!')):][:2] != HEADER] == []
+    assert [path for path in SOURCES if not ast.get_docstring(tree_of(path))] == []
 
 
-@pytest.mark.medium
-@each_module
-def test_rooms_import_one_way(path):
-    room = room_of(path)
-    rooms = {name.split('.')[1] for name in imports(path) if name.startswith('fourbar_ros.')}
-    assert (rooms & set(MAY_IMPORT)) - {room} <= set(MAY_IMPORT[room])
+def test_rooms_import_one_way():
+    forbidden = {}
+    for path in MODULES:
+        room = room_of(path)
+        rooms = {name.split('.')[1] for name in imports(path) if name.startswith('fourbar_ros.')}
+        if wrong := (rooms & set(MAY_IMPORT)) - {room} - set(MAY_IMPORT[room]):
+            forbidden[path] = wrong
+    assert forbidden == {}
 
 
-@pytest.mark.medium
 def test_imports_have_no_cycles():
     """The graph of files includes imports inside functions and for type checking."""
     names = {path: '.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__')
@@ -123,25 +126,23 @@ def test_every_folder_is_a_known_room():
     assert {room_of(path) for path in MODULES} <= set(MAY_IMPORT)
 
 
-@each_module
-def test_only_ros_rooms_import_ros(path):
-    if room_of(path) not in ('ros', 'operator'):
-        assert ros_packages(path) == set()
+def test_only_ros_rooms_import_ros():
+    assert {path: ros_packages(path) for path in MODULES
+            if room_of(path) not in ('ros', 'operator') and ros_packages(path)} == {}
 
 
-@each_module
-def test_ros_packages_are_declared(path):
-    assert ros_packages(path) <= dependencies()
+def test_ros_packages_are_declared():
+    declared = dependencies()
+    assert {path: ros_packages(path) - declared for path in MODULES
+            if ros_packages(path) - declared} == {}
 
 
-@pytest.mark.medium
-@each_module
-def test_kernels_are_compiled_in_one_place_and_from_hashed_sources(path):
+def test_kernels_are_compiled_in_one_place_and_from_hashed_sources():
     """The cache of the kernels is valid only if its fingerprint covers all sources."""
-    if path != PACKAGE / 'kernels' / 'compiler.py':
-        assert 'numba' not in {name.split('.')[0] for name in imports(path)}
-    if 'fourbar_ros.kernels.compiler.kernel' in imports(path):
-        assert room_of(path) in compiler.ROOMS
+    assert [path for path in MODULES if path != PACKAGE / 'kernels' / 'compiler.py'
+            and 'numba' in {name.split('.')[0] for name in imports(path)}] == []
+    assert [path for path in MODULES if 'fourbar_ros.kernels.compiler.kernel' in imports(path)
+            and room_of(path) not in compiler.ROOMS] == []
 
 
 def test_every_command_has_its_executable():

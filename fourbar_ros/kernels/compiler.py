@@ -95,7 +95,7 @@ class _Announcement(event.Listener):  # type: ignore[misc]
 
     def on_start(self, occasion: event.Event) -> None:
         if not self._done:
-            print('Compiling the kernels, once after an installation (half a minute)',
+            print('Compiling the kernels, once after an installation (two minutes)',
                   file=self._stream, flush=True)
         self._done += 1
         if self._stream.isatty():

@@ -355,12 +355,13 @@ def test_segment_without_motion_has_the_least_duration(paper: Mechanism) -> None
 
 
 def test_trajectory_is_checked_like_a_step(paper: Mechanism) -> None:
-    """A trajectory of one point is a soft step; its error has no shortest duration."""
+    """Points on a soft step give the same quintic; the error has no shortest duration."""
     segment = quarter_turn(10.0)
     present = present_at(paper, segment)
     trajectory, _ = read_trajectory(
-        paper, ['link_a', 'link_b'], [Point(segment.goal.tolist(), 10.0)], segment.start,
-        present, present)
+        paper, ['link_a', 'link_b'],
+        [Point(*segment.at(time)[:1].tolist(), time, *segment.at(time)[1:].tolist())
+         for time in (2.0, 5.0, 9.0, 10.0)], segment.start, present, present)
     expected = needs_of(paper, segment, present, fresh(paper))
     needs = check_needs(paper, trajectory, present, fresh(paper))
     np.testing.assert_allclose(needs.peak_speeds, expected.peak_speeds, rtol=1e-4)
