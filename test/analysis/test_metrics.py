@@ -33,6 +33,7 @@ def motion_with(synthetic, tmp_path):
     return make
 
 
+@pytest.mark.medium
 def test_every_metric_is_present_and_read_back_from_json(result):
     assert result['missing'] == {}
     assert json.loads(json.dumps(result, allow_nan=False)) == result
@@ -137,6 +138,7 @@ def test_late_recorder_does_not_shift_the_start(motion_with, synthetic):
     assert find_manoeuvre(motion_with(delay)).start_ns == synthetic.START_NS
 
 
+@pytest.mark.medium
 def test_refused_setpoint_is_not_the_begin_of_the_motion(motion_with, synthetic):
     def refuse(messages):
         received_ns, _ = messages['/setpoint'][0]

@@ -19,6 +19,8 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin, Writer
 
+pytestmark = pytest.mark.medium
+
 # Settings of the recorded run.
 OWN = asdict(load_scenario('prototype').estimator)
 LINKS = ('link_a', 'link_b', 'link_c', 'link_d')
@@ -56,7 +58,6 @@ def same(loop_bag, tmp_path_factory):
 
 # The new bag
 
-@pytest.mark.medium
 def test_same_settings_give_the_same_estimates_bit_for_bit(synthetic, loop_bag, same):
     topics = [f'/estimate/{name}' for name in ESTIMATES]
     old, new = ([(topic, synthetic.STORE.deserialize_cdr(data, kind))
@@ -76,7 +77,6 @@ def test_other_topics_are_copied_unchanged(loop_bag, same):
         *others, *(f'/estimate/{name}' for name in (*ESTIMATES, 'waiting'))}
 
 
-@pytest.mark.medium
 def test_estimates_have_stamp_and_log_time_of_their_ticks(same):
     ticks = read_bag(same[1]).arrivals('flywheel_states')
     states = read_bag(same[1]).arrivals('estimate/link_states')
@@ -96,7 +96,6 @@ def test_frame_is_that_of_the_node(synthetic, same):
     assert synthetic.STORE.deserialize_cdr(data, kind).header.frame_id == 'table'
 
 
-@pytest.mark.medium
 def test_same_bag_and_settings_give_the_same_bytes(loop_bag, tmp_path):
     values = {**OWN, 'angle_noise': 0.004}
     for folder in ('one', 'two'):
@@ -106,7 +105,6 @@ def test_same_bag_and_settings_give_the_same_bytes(loop_bag, tmp_path):
             tmp_path / 'two' / 'new' / name).read_bytes()
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize('how', [
     {'compression': CompressionMode.MESSAGE, 'version': 8},
     {'compression': CompressionMode.FILE, 'storage': StoragePlugin.SQLITE3}], ids=str)
@@ -116,7 +114,6 @@ def test_storage_has_no_effect(synthetic, loop_messages, same, tmp_path, how):
     assert stored(tmp_path / 'new') == stored(same[1])
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize('storage', list(StoragePlugin), ids=lambda plugin: plugin.name)
 def test_single_file_suffices(synthetic, loop_messages, same, tmp_path, storage):
     bag = synthetic.write_bag(tmp_path / 'bag', loop_messages, storage)
@@ -125,7 +122,6 @@ def test_single_file_suffices(synthetic, loop_messages, same, tmp_path, storage)
     assert stored(tmp_path / 'new') == stored(same[1])
 
 
-@pytest.mark.medium
 def test_bag_of_an_older_recorder(synthetic, loop_messages, same, tmp_path):
     """A bag in SQLite before Iron has no definitions, no hashes, and another version."""
     from ruamel.yaml import YAML
@@ -148,7 +144,6 @@ def test_bag_of_an_older_recorder(synthetic, loop_messages, same, tmp_path):
     assert stored(tmp_path / 'new') == stored(same[1])
 
 
-@pytest.mark.medium
 def test_messages_of_unknown_types_are_copied_with_their_definitions(
         synthetic, loop_bag, tmp_path):
     text, digest = 'uint8 level\n', 'RIHS01_' + 'ab' * 32
@@ -203,7 +198,6 @@ def test_only_suite_is_found_in_its_namespace(synthetic, loop_messages, tmp_path
     assert replay(bag, tmp_path / 'new', OWN).namespace == '/lab'
 
 
-@pytest.mark.medium
 def test_mechanism_is_that_of_the_device_unless_it_is_given(loop_bag, same, tmp_path):
     assert same[0].mechanism == 'prototype'
     found = replay(loop_bag, tmp_path / 'new', {**OWN, 'mechanism': 'paper'})
@@ -236,7 +230,6 @@ def test_bad_settings_are_refused(loop_bag, refuses, tmp_path, values, kind, exp
 
 # The comparison
 
-@pytest.mark.medium
 def test_differences_are_the_changes_of_the_recorded_estimate(
         synthetic, loop_messages, tmp_path):
     """The change is constant, so it is rms and largest difference; a whole turn is none."""
@@ -265,7 +258,6 @@ def test_differences_are_the_changes_of_the_recorded_estimate(
         assert found['replayed_minus_truth'][name][key] < 0.05
 
 
-@pytest.mark.medium
 def test_difference_before_both_estimates_have_settled_does_not_count(
         synthetic, loop_messages, tmp_path):
     """The comparison starts after the start of a recorded estimator that is a second late."""
@@ -278,7 +270,6 @@ def test_difference_before_both_estimates_have_settled_does_not_count(
     assert as_json(comparison)['replayed_minus_recorded']['samples'] == len(stamps) - 125
 
 
-@pytest.mark.medium
 def test_bag_without_estimates_and_truth_has_fewer_comparisons(synthetic, loop_messages, tmp_path):
     bare = {topic: loop_messages[topic] for topic in ('/link_angles', '/flywheel_states')}
     bag = synthetic.write_bag(tmp_path / 'bag', bare)
@@ -292,7 +283,6 @@ def test_bag_without_estimates_and_truth_has_fewer_comparisons(synthetic, loop_m
     assert render(lambda: comparison_figure(comparison), 'png').startswith(b'\x89PNG')
 
 
-@pytest.mark.medium
 def test_unusable_messages_are_counted_and_have_no_effect(synthetic, loop_messages, tmp_path):
     def spoilt(index, message):
         bad = {100: ([*LINKS[:3], 'link_x'], [0.0] * 4), 200: (LINKS, [np.nan] * 4),
@@ -311,7 +301,6 @@ def test_unusable_messages_are_counted_and_have_no_effect(synthetic, loop_messag
     assert found['identical']
 
 
-@pytest.mark.medium
 def test_repeated_tick_is_answered_again(synthetic, loop_messages, tmp_path):
     messages = changed(loop_messages, '/flywheel_states',
                        lambda index, message: [message] * (2 if index == 300 else 1))
@@ -321,7 +310,6 @@ def test_repeated_tick_is_answered_again(synthetic, loop_messages, tmp_path):
     assert np.sum(np.diff(states.stamp_ns) == 0) == 1
 
 
-@pytest.mark.medium
 def test_gated_samples_and_faults_are_counted(synthetic, loop_messages, tmp_path):
     """Link c has an error of 0.1 rad for half a second; the recorded faults differ."""
     def off(index, message):
@@ -431,7 +419,6 @@ def test_single_file_cut_anywhere_is_refused(loop_bag, refused, tmp_path):
         refused(file, 'damaged')
 
 
-@pytest.mark.medium
 def test_bag_that_lost_messages_is_refused(synthetic, loop_messages, refuses, tmp_path):
     """The metadata of the bag states more messages."""
     bag = synthetic.write_bag(tmp_path / 'bag', loop_messages, StoragePlugin.SQLITE3)

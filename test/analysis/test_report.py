@@ -16,6 +16,8 @@ from fourbar_ros.plotting import style
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.medium
+
 FOUR = np.ones(4)
 PAPER = Mechanism(
     0.1 * FOUR, 0.02 * FOUR, 2.2e-5 * FOUR, np.tile([0.05, 0.0], (4, 1)), 3.4e-7 * FOUR)

@@ -90,6 +90,7 @@ def test_every_setting_has_its_option(capsys):
         assert f'(default {row.default:g})' in text
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(('arguments', 'named'), [
     (['nowhere'], 'nowhere: '),
     (['run1', '-o', 'taken'], 'taken '),

@@ -286,6 +286,7 @@ def test_closed_loop_table_is_the_recorded_run(tmp_path: Path) -> None:
     assert output.read_text() == ''.join(record_run(scenario).lines())
 
 
+@pytest.mark.medium
 def test_closed_loop_moves_the_mechanism_by_torques_for_the_model(tmp_path: Path) -> None:
     """The tables agree until the first torque, which follows arm_at."""
     config = share_directory() / 'config'

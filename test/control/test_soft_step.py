@@ -37,6 +37,7 @@ def test_peak_rate_is_fifteen_eighths_of_the_mean() -> None:
     np.testing.assert_allclose(peak, 15.0 / 8.0 * (GOAL - REST[0]) / 10.0, rtol=1e-14)
 
 
+@pytest.mark.medium
 @settings(derandomize=True)
 @given(start=starts, goal=pairs, duration=durations)
 def test_it_starts_and_ends_as_asked(start: Array, goal: Array, duration: float) -> None:

@@ -88,6 +88,7 @@ class Run:
 
 # Tracking the linkage
 
+@pytest.mark.medium
 @pytest.mark.parametrize('branch', ['open', 'crossed'])
 def test_errors_settle_within_their_sigmas(mechanism: Mechanism, branch: str) -> None:
     run = Run(mechanism, InitialState(0.3, 1.6, branch, 0.5, -0.3))
@@ -154,6 +155,7 @@ def test_joint_encoders_alone_do_not_start_the_filter(paper: Mechanism) -> None:
     assert run.tick() is not None
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     'links', [links for n in (1, 2, 3) for links in combinations(range(4), n)])
 def test_any_subset_of_links_updates_the_filter(links: tuple[int, ...], uneven: Mechanism) -> None:

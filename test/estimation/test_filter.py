@@ -186,6 +186,7 @@ def test_nis_is_chi_square_of_four(consistency: Consistency) -> None:
     assert low < consistency.nis.mean() < high
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('tick', [0, TICKS // 3, TICKS - 1])
 def test_nees_is_chi_square_of_four(tick: int, consistency: Consistency) -> None:
     """Runs are independent, ticks are not: the bounds hold for one tick over all runs."""
@@ -193,6 +194,7 @@ def test_nees_is_chi_square_of_four(tick: int, consistency: Consistency) -> None
     assert low < consistency.nees[:, tick].mean() < high
 
 
+@pytest.mark.medium
 def test_estimates_are_without_bias(consistency: Consistency) -> None:
     last = consistency.errors[:, -1]
     mean = last.mean(axis=0) / (last.std(axis=0, ddof=1) / np.sqrt(RUNS))

@@ -301,6 +301,7 @@ def test_emulated_link_reports_a_second_sender_of_its_identifier(world, refuses)
         world.wire.emulators[0].receive(frame, world.wire.now_ns)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('links', [(0, 1, 3), (0,)])
 def test_missing_links_are_named_and_nothing_is_driven(make_world, links) -> None:
     world = make_world(links=links)
@@ -484,11 +485,11 @@ def write(tmp_path: Path, **changes) -> str:
 
 
 def test_safety_table_of_emulated_links_differs_only_in_timeouts() -> None:
-    """The timeout is half a second, because a shared computer may stall."""
+    """The timeout is a second, because a shared computer may stall."""
     real, emulated = load_safety('prototype'), load_safety('emulated')
     assert {name for name in real if real[name] != emulated[name]} == {
         'wheel_silent', 'heartbeat_lost', 'not_armed', 'unasked_torque'}
-    assert emulated['wheel_silent'].limit == 0.5
+    assert emulated['wheel_silent'].limit == 1.0
     assert emulated['wheel_silent'].level == real['wheel_silent'].level
 
 

@@ -131,6 +131,7 @@ def test_division_by_zero_is_inf_as_in_numpy(first):
     assert first['inverse'] == float('inf')
 
 
+@pytest.mark.medium
 def test_nothing_is_written_beside_the_sources(common, first):
     assert not list(common.root.rglob('*.nbi'))
 
@@ -150,6 +151,7 @@ def test_numba_cache_dir_of_the_user_has_priority(common, chosen):
     assert list((common.folder / 'chosen').rglob('*.nbi'))
 
 
+@pytest.mark.medium
 def test_other_code_keeps_its_own_cache_folder(common, first, chosen):
     assert first['numba'] == ''
     assert chosen['numba'] == str(common.folder / 'chosen')

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 import pytest
 
+pytestmark = pytest.mark.medium
+
 Recorded = dict[str, NDArray[np.float64]]
 
 # Peak rate of the soft step times duration over distance.

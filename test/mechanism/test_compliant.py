@@ -113,6 +113,7 @@ def test_motion_agrees_with_an_independent_derivation(
     assert error[12:].max() < constants.fastest_joint_mode * (0.03 * late + 1e-11)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('seed', SEEDS)
 def test_integration_is_of_order_four(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],
@@ -232,6 +233,7 @@ def test_energy_is_conserved_without_damping(
     np.testing.assert_allclose(energies, energies[0], rtol=0.0, atol=TAKEN * swings)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('seed', SEEDS)
 def test_damping_reduces_the_energy_at_every_step(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],

@@ -259,6 +259,7 @@ def test_energy_changes_by_the_work_of_the_effects(
     assert abs(gained) > 1e-4
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('seed', SEEDS)
 def test_friction_and_drag_never_give_energy(
     seed: int, random_linkage: Draw, random_state: Callable[..., Array],

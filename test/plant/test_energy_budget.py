@@ -66,6 +66,7 @@ def driven(plant: Plant, seconds: float) -> Plant:
     return plant
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('compliant', [False, True], ids=['rigid', 'compliant'])
 @pytest.mark.parametrize('effect', list(EFFECTS))
 def test_energy_and_momentum_budgets_balance(

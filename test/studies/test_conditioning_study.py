@@ -128,6 +128,7 @@ def test_grids_are_written_and_symmetric(result: Result) -> None:
                 THETAS[99]), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_near_a_change_point_four_wheels_keep_the_gain_that_a_and_b_lose(result: Result) -> None:
     """The loss of gain does not show in cond(A) of equal links."""
     rows = list(csv.DictReader(StringIO(str(result.files['conditioning_hidden.csv']))))
@@ -141,6 +142,7 @@ def test_near_a_change_point_four_wheels_keep_the_gain_that_a_and_b_lose(result:
     assert min(float(row['closure_ratio']) for row in longer) > 0.05
 
 
+@pytest.mark.slow
 def test_further_linkage_is_evaluated_on_both_branches(result: Result) -> None:
     rows = list(csv.DictReader(StringIO(str(result.files['conditioning_linkage.csv']))))
     assert {row['branch'] for row in rows} == {'open', 'crossed'}
@@ -160,6 +162,7 @@ def test_without_a_mechanism_there_is_no_third_figure() -> None:
         studied('no such linkage')
 
 
+@pytest.mark.slow
 def test_figures_are_complete(result: Result) -> None:
     """Figures have contents in the middle and none at the left edge."""
     image = pytest.importorskip('matplotlib.image')

@@ -252,6 +252,7 @@ def easy(run: CrossingRun) -> bool:
     return run.manoeuvre.mismatch < 1e-3 or run.manoeuvre.stiffness == 1e4 and run.seed % 2 == 0
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('passes', [easy, lambda run: False, lambda run: True],
                          ids=['some', 'none', 'all'])
 def test_numbers_are_of_the_runs_that_they_name(

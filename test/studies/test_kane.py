@@ -86,6 +86,7 @@ def test_wheels_without_torque_conserve_momentum_and_energy(
         speeds, np.broadcast_to(speeds[0], speeds.shape), rtol=0.0, atol=1e-10)
 
 
+@pytest.mark.medium
 def test_wheels_locked_to_their_links_conserve_momentum_and_energy(
     moving: Case, conserved: Conserved,
 ) -> None:
@@ -131,6 +132,7 @@ def test_closure_is_conserved(moving: Case) -> None:
     np.testing.assert_allclose(motion.closure_error, gap, rtol=0.0, atol=1e-15)
 
 
+@pytest.mark.medium
 def test_torque_of_a_prescribed_wheel_gives_the_same_motion(paper: Mechanism) -> None:
     """
     Wheels a and c of a rhombus at rest are prescribed, or driven by the equivalent torque.

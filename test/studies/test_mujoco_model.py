@@ -138,6 +138,7 @@ def test_stiff_closure_has_the_error_of_the_held_torque(path: Path) -> None:
     assert np.abs(state.centre_position).max() < 1e-11
 
 
+@pytest.mark.medium
 @each_case
 def test_error_of_euler_is_half_a_step(path: Path) -> None:
     reference = Reference(path)

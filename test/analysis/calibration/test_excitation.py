@@ -37,6 +37,7 @@ def test_one_wheel_after_the_other_and_all_come_to_rest(
     assert np.abs(wheels.speeds[-1]).max() < 6.0
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('wheel', range(4))
 @pytest.mark.parametrize('phi_b', [0.9, 1.2, 2.0, 2.2])
 def test_first_direction_leads_away_from_change_points(

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 import pytest
 from scipy.stats import binom
 
-SEEDS = range(4)
 START = {'prototype': InitialState(), 'irregular': InitialState(link_b=1.3)}
 
 
@@ -39,20 +38,22 @@ def reduced(mechanism: Mechanism, poses: NDArray[np.float64]) -> NDArray[np.floa
         for pose in poses])
 
 
-@pytest.fixture(scope='module')
-def estimates(prototype: Mechanism, irregular: Mechanism, lab: Table, excited: Callable[..., Any]
+@pytest.fixture(scope='module', params=[
+    pytest.param(1, id='one seed'), pytest.param(4, id='four seeds', marks=pytest.mark.slow)])
+def estimates(request: pytest.FixtureRequest, prototype: Mechanism, irregular: Mechanism,
+              lab: Table, excited: Callable[..., Any]
               ) -> dict[str, list[tuple[Mechanism, LinkEstimate]]]:
-    """Estimate both linkages on the table of the prototype, seeds 0 to 3."""
+    """Estimate both linkages on the table of the prototype, seeds from 0."""
     found: dict[str, list[tuple[Mechanism, LinkEstimate]]] = {}
     for name, truth in (('prototype', prototype), ('irregular', irregular)):
         found[name] = []
-        for seed in SEEDS:
+        for seed in range(request.param):
             links, wheels = excited(truth, lab, MultiSine(truth, 24.0, 0.02), seed, START[name])
             found[name].append((truth, link_estimate(prior_mechanism(truth, seed), links, wheels)))
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.parametrize('name', START)
 def test_reduced_inertias_are_found_to_one_percent(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]], name: str) -> None:
@@ -86,11 +87,12 @@ def test_disturbance_in_the_residuals_is_reported(
     assert len(links_text(pushed, [], []).splitlines()) == len(without) + 1
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize('name', START)
 def test_intervals_cover_the_truth(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]], name: str) -> None:
     """
-    A_aa, A_ab and A_bb at a middle pose: of 12 intervals at 95 %, seeds 0 to 3.
+    A_aa, A_ab and A_bb at a middle pose: three intervals at 95 % for each seed.
 
     The bound of the count has a probability of 1e-3 for independent intervals.
     """
@@ -99,9 +101,10 @@ def test_intervals_cover_the_truth(
         wanted = reduced(truth, found.poses)[3:6]
         for item, value in zip(found.reduced_inertias()[3:6], wanted):
             covered += abs(item.value - value) < QUANTILE_95 * item.standard_error
-    assert covered >= binom.ppf(1e-3, 3 * len(SEEDS), 0.95), 'seeds 0-3'
+    assert covered >= binom.ppf(1e-3, 3 * len(estimates[name]), 0.95), 'seeds from 0'
 
 
+@pytest.mark.medium
 def test_rhombus_determines_four_combinations_and_another_linkage_more(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]]) -> None:
     """
@@ -116,6 +119,7 @@ def test_rhombus_determines_four_combinations_and_another_linkage_more(
         assert sum(one.determined for one in found.combinations) > 4, seed
 
 
+@pytest.mark.medium
 def test_sums_over_opposite_links_are_determined_and_differences_are_not(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]]) -> None:
     """
@@ -136,6 +140,7 @@ def test_sums_over_opposite_links_are_determined_and_differences_are_not(
         assert np.linalg.norm(moved) < np.linalg.norm(away), f'seed {seed}'
 
 
+@pytest.mark.medium
 def test_noise_of_the_sensors_is_what_is_left(
         estimates: dict[str, list[tuple[Mechanism, LinkEstimate]]], lab: Table) -> None:
     """Residuals are noise and rounding to 14 bits; their rms is known to half a percent."""
