@@ -132,7 +132,8 @@ def change_point() -> Figure:
 def _passage(mismatch: float) -> tuple[Array, Array]:
     lengths = np.array([0.1 * (1.0 + mismatch), 0.1, 0.1, 0.1])
     mechanism = Mechanism(
-        lengths, [0.02] * 4, [2.2e-5] * 4, np.column_stack([0.5 * lengths, NONE]), [3.4e-7] * 4)
+        lengths, np.full(4, 0.02), np.full(4, 2.2e-5), np.column_stack([0.5 * lengths, NONE]),
+        np.full(4, 3.4e-7))
     angles = assemble(mechanism, 0.0, -0.3)
     rates = np.array([0.0, 1.0])
     rates = np.concatenate([rates, reduced_form(mechanism, angles, rates).gamma @ rates])
@@ -231,7 +232,7 @@ def quarter_turn() -> tuple[Array, list[EnergyBudget]]:
         if n == 125:
             controller.setpoint(('link_a', 'link_b'), (0.5 * np.pi, 5.0 * np.pi / 6.0))
         control = controller.tick(round(1e9 + n * 4e6), truth.link_angles, truth.link_rates,
-                                  truth.wheel_speeds, truth.efforts)
+                                  np.zeros(2), truth.wheel_speeds, truth.efforts)
         ledgers.append(plant.ledger())
         plant.advance(8, control.torques)
     return times, ledgers
@@ -259,6 +260,7 @@ def sensors() -> Figure:
     detail = figure.add_subplot(grid[0])
     _draw_arrivals(detail, truth, [sample for sample in samples if sample[2] == 'link_a'])
     panels = grid[1].subgridspec(4, 1).subplots(sharex=True, sharey=True)
+    assert isinstance(panels, np.ndarray)
     for link, (name, axes) in enumerate(zip(LINK_NAMES, panels)):
         stamps, errors = np.array([
             (1e-9 * measured, np.remainder(angle - truth[measured][link] + np.pi, 2.0 * np.pi)
@@ -279,6 +281,7 @@ def sensor_bias() -> Figure:
     """Draw the detection of a small bias of one sensor, and its effect on the estimate."""
     begin, error = 3.0, np.radians(0.35)
     loop = make_loop(load_scenario('prototype'))
+    assert isinstance(loop.supervisor.device, SimulatedTable)
     times, samples, errors, sums = [], [], [], []
     for n in range(round((begin + 0.4) / 4e-3)):
         if n == round(begin / 4e-3):
