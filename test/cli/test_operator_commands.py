@@ -204,6 +204,7 @@ def test_status_has_empty_fault_lines_without_faults(armed, fourbar):
     assert ['wheel_faults'] in shown
 
 
+@pytest.mark.slow
 def test_hold_ends_a_move_and_damp_holds_no_position(armed, fourbar):
     assert fourbar('setpoint', 'link_b=70deg') == (0, 'accepted\n', '')
     assert fourbar('hold') == (0, 'holds\n', '')
@@ -214,6 +215,7 @@ def test_hold_ends_a_move_and_damp_holds_no_position(armed, fourbar):
     armed.status('controller_status', mode='hold')
 
 
+@pytest.mark.slow
 def test_hold_after_a_move_drops_its_goal(armed, fourbar):
     assert fourbar('setpoint', 'link_b=80deg') == (0, 'accepted\n', '')
     assert armed.status('controller_status', mode='hold')['goal'] != ''
@@ -221,6 +223,7 @@ def test_hold_after_a_move_drops_its_goal(armed, fourbar):
     armed.status('controller_status', mode='hold', goal='')
 
 
+@pytest.mark.slow
 def test_disabled_controller_drives_no_wheel_until_it_is_enabled(armed, fourbar):
     assert fourbar('disable') == (0, 'not enabled: the wheels get no torque\n', '')
     armed.status('controller_status', mode='idle')

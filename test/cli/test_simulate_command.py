@@ -265,7 +265,7 @@ def closed_loop(output: Path, *arguments: str) -> bytes:
     return output.read_bytes()
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_same_seed_gives_the_same_bytes_in_another_process(tmp_path: Path) -> None:
     first, other = closed_loop(tmp_path / '1.csv'), tmp_path / '2.csv'
     done = subprocess.run(

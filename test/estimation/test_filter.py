@@ -186,7 +186,7 @@ def test_nis_is_chi_square_of_four(consistency: Consistency) -> None:
     assert low < consistency.nis.mean() < high
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize('tick', [0, TICKS // 3, TICKS - 1])
 def test_nees_is_chi_square_of_four(tick: int, consistency: Consistency) -> None:
     """Runs are independent, ticks are not: the bounds hold for one tick over all runs."""

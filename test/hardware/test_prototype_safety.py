@@ -458,7 +458,7 @@ def test_links_stay_stopped_until_a_reset_arrives(driven) -> None:
     assert driven.arm() == (True, 'armed')
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_flood_of_foreign_frames_does_not_delay_the_host(driven) -> None:
     for _ in range(5000):
         driven.wire.inject(Frame(0x7FF, b'?'))
@@ -485,11 +485,11 @@ def write(tmp_path: Path, **changes) -> str:
 
 
 def test_safety_table_of_emulated_links_differs_only_in_timeouts() -> None:
-    """The timeout is a second, because a shared computer may stall."""
+    """The timeout is half a second, because a shared computer may stall."""
     real, emulated = load_safety('prototype'), load_safety('emulated')
     assert {name for name in real if real[name] != emulated[name]} == {
         'wheel_silent', 'heartbeat_lost', 'not_armed', 'unasked_torque'}
-    assert emulated['wheel_silent'].limit == 1.0
+    assert emulated['wheel_silent'].limit == 0.5
     assert emulated['wheel_silent'].level == real['wheel_silent'].level
 
 

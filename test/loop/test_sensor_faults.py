@@ -80,7 +80,7 @@ def test_fault_of_one_sensor_is_isolated_and_the_error_is_small(
     assert worst < LARGEST_ERROR
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', range(2))
 def test_wheels_alone_drive_the_estimate_for_a_second_until_it_is_lost(
     seed: int, scenario: Scenario,

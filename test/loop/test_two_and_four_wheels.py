@@ -63,6 +63,7 @@ def test_both_allocations_make_the_turn(allocation: str, runs: dict[str, Recorde
     np.testing.assert_allclose(theta, theta[0], rtol=0.0, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('allocation', 'of_a_pair'), [('min_norm', 2), ('two_wheels', 1)])
 def test_wheels_take_the_momentum_of_their_pair(
     allocation: str, of_a_pair: int, quarter_turn: Scenario, runs: dict[str, Recorded],
@@ -78,6 +79,7 @@ def test_wheels_take_the_momentum_of_their_pair(
         peaks[2:], wanted if of_a_pair == 2 else 0.0, rtol=CLOSE, atol=1e-3 * wanted)
 
 
+@pytest.mark.slow
 def test_four_wheels_need_half_of_the_speed_energy_and_eq9(runs: dict[str, Recorded]) -> None:
     four, two = runs['min_norm'], runs['two_wheels']
     ratios = {

@@ -224,7 +224,8 @@ def test_plant_without_commands_disarms_after_the_timeout(testbed):
     assert float(status['since']) > 1e9
 
 
-@pytest.mark.parametrize('action', ['coast', 'hold_speed', 'brake'])
+@pytest.mark.parametrize('action', [
+    'coast', *(pytest.param(other, marks=pytest.mark.slow) for other in ('hold_speed', 'brake'))])
 def test_timeout_action(suite, make_probe, action):
     suite.node('plant', {'timeout_action': action}, f'/{action}')
     testbed = make_probe(f'/{action}')

@@ -55,6 +55,7 @@ def check_left_without_torque(plant):
     assert list(commands[-1].effort) == [0.0] * 4
 
 
+@pytest.mark.slow
 def test_encoder_offsets_of_a_plant_without_offsets_are_zero(start, tmp_path):
     """The tolerance is five standard errors of 450 samples with 0.1 deg of noise."""
     made, numbers = tmp_path / 'mechanism.yaml', tmp_path / 'zeros.json'
@@ -100,6 +101,7 @@ def test_inertia_and_friction_of_one_wheel_are_found(start, plant, tmp_path):
     assert json.loads(again.read_text())['quantities'] == found['quantities']
 
 
+@pytest.mark.slow
 def test_command_ends_when_the_device_is_disarmed(start, plant):
     process = start(*WHEELS)
     wait_for_torque(plant)

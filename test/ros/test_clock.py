@@ -67,8 +67,10 @@ def nodes(make_probe, suite, request):
     return start
 
 
-@pytest.mark.parametrize('order', [('plant', 'estimator', 'controller'),
-                                   ('controller', 'estimator', 'plant')], ids=lambda o: o[0])
+@pytest.mark.parametrize('order', [
+    ('plant', 'estimator', 'controller'),
+    pytest.param(('controller', 'estimator', 'plant'), marks=pytest.mark.slow)],
+    ids=lambda o: o[0])
 def test_every_tick_is_answered_before_the_next(nodes, order):
     """No tick is missing from the first one on, in any order of start."""
     namespace, testbed, _ = nodes(*order)
@@ -182,6 +184,7 @@ def test_clock_topic_is_monotonic_with_a_limited_rate(nodes, clock):
     assert arrays[-1].header.stamp.sec < 10 ** 6
 
 
+@pytest.mark.slow
 def test_fast_clock_is_faster_than_real_time_and_skips_no_tick(nodes):
     """The module test_clock_modes tests the ratio; here a busy machine may lag and catch up."""
     namespace, testbed, _ = nodes('plant', clock='fast', real_time_factor=2.0)

@@ -44,6 +44,7 @@ def test_wrong_sensor_has_the_given_error(testbed):
     assert set_fault(testbed, 'fault.link_b', 'none')[0]
 
 
+@pytest.mark.slow
 def test_estimator_gates_a_wrong_sensor_and_reports_it(suite, make_probe):
     """The error of the estimate is far smaller than the error of the sensor."""
     watch = make_probe('/wrong')

@@ -255,6 +255,7 @@ def test_bad_input_ends_a_node_with_one_line(refused, case):
     assert process.stdout == ''
 
 
+@pytest.mark.slow
 # Order of start
 
 def test_links_may_start_after_the_host_and_missing_links_are_named(suite, make_probe):
@@ -292,7 +293,8 @@ def test_links_may_start_after_the_host_and_missing_links_are_named(suite, make_
 # End of the node
 
 @pytest.mark.parametrize(
-    'number', [signal.SIGINT, signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)],
+    'number', [signal.SIGTERM, *(pytest.param(number, marks=pytest.mark.slow)
+                                 for number in (signal.SIGINT, signal.SIGHUP))],
     ids=lambda number: number.name)
 def test_last_commands_before_the_end_are_without_torque(suite, make_probe, number):
     """Links with a long command timeout coast at once."""

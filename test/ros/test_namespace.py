@@ -42,6 +42,7 @@ def test_status_on_the_common_diagnostics_names_its_node(labs):
         assert labs['lab'].diagnostics(name).name == name
 
 
+@pytest.mark.slow
 def test_loop_in_a_namespace_has_no_effect_on_the_other_one(labs):
     lab, other = labs['lab'], labs['other']
     before = other.status('controller_status')

@@ -25,7 +25,8 @@ def distinct(messages):
 
 
 @pytest.fixture(scope='module', params=[
-    'realtime', pytest.param('fast', marks=pytest.mark.slow), 'lockstep'])
+    pytest.param('realtime', marks=pytest.mark.slow),
+    pytest.param('fast', marks=pytest.mark.slow), 'lockstep'])
 def testbed(request, module_suite, make_probe):
     """Run a plant in each clock mode, its wheels driven by the probe."""
     namespace = f'/{request.param}'

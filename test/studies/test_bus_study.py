@@ -9,6 +9,7 @@ import pytest
 pytestmark = pytest.mark.node
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_in_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     """The round trips depend on the machine and have no limit here."""
     monkeypatch.setattr(bus, 'ANSWER_TIMEOUT_S', 0.1)     # the largest that is allowed
