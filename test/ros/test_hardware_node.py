@@ -422,11 +422,12 @@ def test_truth_is_published_at_250_hz_with_system_time(bench):
     bench.probe.more('sim/ledger', 3)
     bench.probe.wait(lambda: len(odometry) > 250)
     for topic in ('sim/link_states', 'sim/flywheel_states', 'sim/odometry'):
-        messages = bench.probe.received[topic][-200:]
-        steps = np.diff([stamp_of(message) for message in messages])
-        assert (steps > 0).all()
-        # The median ignores messages that a delayed process skips.
-        assert np.median(steps) == 4_000_000
+        def steps(topic=topic):
+            return np.diff([stamp_of(message) for message in bench.probe.received[topic][-200:]])
+        # The median ignores messages that a delayed process skips; a busy machine may delay more
+        # than half of them for a while.
+        bench.probe.wait(lambda steps=steps: np.median(steps()) == 4_000_000)
+        assert (steps() > 0).all()
     truth = bench.probe.received['sim/link_states']
     newest = bench.probe.wait(lambda: next(
         (message for message in truth[-1:]
