@@ -50,9 +50,6 @@ class SimulatedTable(Device):
         self._longest_delay = round(WHEEL_FAULTS['delayed'].high * 1e9) // self._step_ns
         self._steps = 0
         self._wheel_angles = self._wheel_angles_before()
-        # Loads the compiled kernels of the budget now: at run time it would delay a tick by more
-        # than the timeout of a wheel.
-        self._plant.ledger()
 
     def reset(self, initial: InitialState) -> None:
         """

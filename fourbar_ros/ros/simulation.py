@@ -115,6 +115,8 @@ class GroundTruth:
         self._message = Odometry()
         self._message.header.frame_id = TABLE_FRAME
         self._message.child_frame_id = LINK_NAMES[0]
+        # Load the kernels of the budget now: at the first message they would delay the ticks.
+        table.ledger()
 
     def publish(self, stamp_ns: int, truth: TrueState) -> None:
         """Publish the true state at a tick."""
