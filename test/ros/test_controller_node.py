@@ -228,9 +228,9 @@ def test_gains_that_are_unstable_at_the_rate_are_refused(testbed):
     assert testbed.status('controller_status', mode='hold')['problem'] == ''
 
 
-@pytest.mark.slow
 # A dead wheel; the last test, because the controller keeps the fault until it is disarmed
 
+@pytest.mark.slow
 def test_dead_wheel_is_named_in_the_status_and_missing_in_commands(testbed, publisher):
     move(testbed, publisher)
     assert set_value(testbed, 'plant', 'fault.flywheel_a', 'dead') == (True, '')
